@@ -1,0 +1,1 @@
+"""Neural fields of the paper. They know tensors only; every size is configuration."""
