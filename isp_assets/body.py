@@ -205,7 +205,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     if path.suffix == ".pkl":
         from isp_assets.safe_pickle import read_smpl_pickle
 
-        return read_smpl_pickle(path)
+        return read_smpl_pickle(path, _KEYS)
     raise BodyError(f"{path}: expected a file ending in .npz or .pkl, got '{path.suffix}'")
 
 

@@ -157,10 +157,12 @@ def _from_arrays(data: Mapping[str, Any], *, up: str, name: str, where: str) -> 
     rate = next((data[key] for key in _RATE_KEYS if key in data), None)
     if rate is None:
         raise MotionError(f"{where}: expected the frame rate under one of {', '.join(_RATE_KEYS)}; none is there")
+    if np.size(rate) != 1 or not np.issubdtype(np.asarray(rate).dtype, np.number):
+        raise MotionError(f"{where}: frame rate: expected one number, got {rate!r}")
     full = np.zeros((count, len(JOINT_NAMES), 3))
     full[:, :_BODY_JOINTS] = poses[:, : 3 * _BODY_JOINTS].reshape(count, _BODY_JOINTS, 3)
     # Checked before the axes are looked at, so that a NaN is reported as a NaN.
-    motion = Motion(full, translation, fps=float(rate), name=name)
+    motion = Motion(full, translation, fps=float(np.asarray(rate).item()), name=name)
     axis = _up_axis(data, full[:, 0], where) if up == "auto" else up
     root, translation = _to_y_up(full[:, 0], translation, axis, _REST_PELVIS[columns])
     full[:, 0] = root
@@ -188,7 +190,7 @@ def _pose_columns(data: Mapping[str, Any], where: str) -> tuple[Float[np.ndarray
 def _up_axis(data: Mapping[str, Any], root: Float[np.ndarray, "T 3"], where: str) -> str:
     """Which axis is up: what the file says, else where the body's own up direction points on average."""
     if "up" in data:
-        return str(data["up"])
+        return str(data["up"]).lower()
     upward = axis_angle_to_matrix(torch.from_numpy(root))[:, :, 1].mean(0)
     if max(upward[1], upward[2]) < 0.5:
         raise MotionError(
