@@ -1,0 +1,174 @@
+"""A collection: a folder of latent bundles, and the garments they hold by name.
+
+``collection.toml`` names the files and says how each garment's cloth looks::
+
+    schema = "isp-assets/collection"
+    version = 1
+    name = "basics"
+    body_sha256 = "..."
+    skin = "skin.safetensors"
+    layering = "layering.safetensors"
+
+    [garments.tank_top]
+    bundle = "top.safetensors"
+    code = "tank_top"
+    color = "#e8e4da"
+    fabric = "knit"
+"""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from isp_assets.bake import FabricStyle
+from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
+from isp_assets.errors import CollectionError
+from isp_assets.outfit import Outfit, OutfitItem
+from isp_assets.toml_file import check_keys, read_toml
+
+SCHEMA = "isp-assets/collection"
+VERSION = 1
+FILE_NAME = "collection.toml"
+DEFAULT_FOLDER = Path(__file__).parent / "data" / "collection"
+
+_KEYS = {
+    "schema": str, "version": int, "name": str, "body_sha256": str, "skin": str, "layering": str, "garments": dict,
+}  # fmt: skip
+_GARMENT_KEYS = {
+    "bundle": str, "code": str, "color": str, "fabric": str, "accent": str, "scale": (int, float), "about": str,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One garment as the collection lists it."""
+
+    name: str
+    bundle: str
+    """File name of the bundle, in the collection's folder."""
+    code: str
+    """Row of the bundle's code table."""
+    style: FabricStyle
+    about: str
+
+
+@dataclass(frozen=True, eq=False)
+class Collection:
+    """Garments by name. Bundles are read when first needed, then kept."""
+
+    folder: Path
+    name: str
+    body_sha256: str
+    entries: dict[str, Entry]
+    skin_file: str
+    layering_file: str | None
+
+    @classmethod
+    def load(cls, source: str | Path = "default") -> "Collection":
+        """Read ``collection.toml`` of a folder; ``"default"`` is the built-in collection.
+
+        Raises:
+            CollectionError: If the folder or a file is missing, or an entry is wrong.
+        """
+        folder = DEFAULT_FOLDER if source == "default" else Path(source)
+        path = folder / FILE_NAME
+        table = read_toml(path, CollectionError)
+        _check_head(table, path)
+        entries = {name: _entry(name, row, path) for name, row in table["garments"].items()}
+        for file in {table["skin"], table.get("layering", table["skin"]), *(e.bundle for e in entries.values())}:
+            if not (folder / file).is_file():
+                raise CollectionError(f"{path}: names the file {file!r}, which is not in {folder}")
+        return cls(folder, table["name"], table["body_sha256"], entries, table["skin"], table.get("layering"))
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the garments, in the file's order."""
+        return tuple(self.entries)
+
+    def entry(self, name: str) -> Entry:
+        """One entry by name.
+
+        Raises:
+            CollectionError: If there is no such garment; the message names the nearest ones.
+        """
+        if name not in self.entries:
+            near = difflib.get_close_matches(name, self.entries, n=3)
+            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it has: {', '.join(self.entries)}"
+            raise CollectionError(f"collection {self.name!r} has no garment {name!r}; {hint}")
+        return self.entries[name]
+
+    def bundle(self, file: str) -> GarmentBundle:
+        """The bundle of one file, checked against the collection's body."""
+        if file not in self._bundles:
+            bundle = GarmentBundle.load(self.folder / file)
+            self._check_body(file, bundle.body_sha256)
+            self._bundles[file] = bundle
+        return self._bundles[file]
+
+    @cached_property
+    def skin(self) -> SkinBundle:
+        """The diffused skinning field that all garments share."""
+        skin = SkinBundle.load(self.folder / self.skin_file)
+        self._check_body(self.skin_file, skin.body_sha256)
+        return skin
+
+    @cached_property
+    def layering(self) -> LayeringBundle | None:
+        """The layering network, if the collection has one."""
+        return LayeringBundle.load(self.folder / self.layering_file) if self.layering_file else None
+
+    def item(self, name: str) -> OutfitItem:
+        """One garment, ready to be worn."""
+        entry = self.entry(name)
+        bundle = self.bundle(entry.bundle)
+        if entry.code not in bundle.codes:
+            raise CollectionError(
+                f"collection {self.name!r}: garment {name!r} names the code {entry.code!r}, "
+                f"which bundle {entry.bundle!r} does not hold"
+            )
+        return OutfitItem(name, bundle, bundle.codes[entry.code], entry.style)
+
+    def outfit(self, names: Sequence[str]) -> Outfit:
+        """An outfit of named garments, innermost first.
+
+        Raises:
+            CollectionError: If a garment is not in the collection.
+            OutfitError: If the list is empty or the parts do not belong together.
+        """
+        return Outfit(tuple(self.item(n) for n in names), self.skin, self.layering)
+
+    @cached_property
+    def _bundles(self) -> dict[str, GarmentBundle]:
+        return {}
+
+    def _check_body(self, file: str, sha256: str) -> None:
+        if sha256 != self.body_sha256:
+            raise CollectionError(
+                f"{self.folder / file}: trained on body {sha256[:12]}, but the collection {self.name!r} is for body "
+                f"{self.body_sha256[:12]}; put the bundle into a collection of its own body, or retrain it"
+            )
+
+
+def _check_head(table: dict[str, Any], path: Path) -> None:
+    check_keys(table, _KEYS, {"schema", "version", "name", "body_sha256", "skin", "garments"}, str(path), CollectionError)
+    if table["schema"] != SCHEMA:
+        raise CollectionError(f"{path}: schema must be {SCHEMA!r}, got {table['schema']!r}")
+    if table["version"] != VERSION:
+        raise CollectionError(f"{path}: version {table['version']} is not known here, only {VERSION}; update isp-assets")
+    if not table["garments"]:
+        raise CollectionError(f"{path}: the collection lists no garments")
+
+
+def _entry(name: str, row: object, path: Path) -> Entry:
+    where = f"{path}: garment {name!r}"
+    if not isinstance(row, dict):
+        raise CollectionError(f"{where}: must be a table, got {type(row).__name__}")
+    check_keys(row, _GARMENT_KEYS, {"bundle"}, where, CollectionError)
+    style = {"color": row.get("color"), "kind": row.get("fabric"), "accent": row.get("accent"), "scale": row.get("scale")}
+    try:
+        fabric = FabricStyle.from_text(**{k: v for k, v in style.items() if v is not None})
+    except ValueError as cause:
+        raise CollectionError(f"{where}: {cause}") from cause
+    return Entry(name, row["bundle"], row.get("code", name), fabric, row.get("about", ""))
