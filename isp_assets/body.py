@@ -22,6 +22,7 @@ from torch import Tensor
 from isp_assets.conventions import JOINT_NAMES, JOINT_PARENTS
 from isp_assets.errors import BodyError
 from isp_assets.geometry.rotations import axis_angle_to_matrix
+from isp_assets.safe_pickle import read_smpl_pickle
 
 _DEFAULT_FILE = Path(__file__).parent / "data" / "default_body.npz"
 _JOINTS = len(JOINT_NAMES)
@@ -203,8 +204,6 @@ def _read(path: Path) -> Mapping[str, Any]:
         except (ValueError, OSError) as error:
             raise BodyError(f"{path}: not a readable .npz of plain arrays ({error}); download it again") from error
     if path.suffix == ".pkl":
-        from isp_assets.safe_pickle import read_smpl_pickle
-
         return read_smpl_pickle(path, _KEYS)
     raise BodyError(f"{path}: expected a file ending in .npz or .pkl, got '{path.suffix}'")
 

@@ -40,11 +40,16 @@ class Device(str, Enum):
 
 
 OutOption = Annotated[Path, typer.Option("--out", help="Output folder; made if missing.")]
-FramesOption = Annotated[str | None, typer.Option("--frames", help="Frame range A-B or A-BxSTEP; overrides the file's.")]
-WriteOption = Annotated[str | None, typer.Option("--write", help="Writers, separated by commas: usd,glb,rerun,sheet.")]
+FramesOption = Annotated[
+    str | None, typer.Option("--frames", help="Frame range A-B or A-BxSTEP; overrides the file's.")
+]
+WriteOption = Annotated[
+    str | None, typer.Option("--write", help="Writers, separated by commas: usd,glb,rerun,sheet.")
+]
 DeviceOption = Annotated[Device, typer.Option("--device", help="Where the networks run.")]
 StepsOption = Annotated[
-    str | None, typer.Option("--steps", help="Rungs to run, of skin,displace,layering,project (for comparisons).")
+    str | None,
+    typer.Option("--steps", help="Rungs to run, of skin,displace,layering,project (for comparisons)."),
 ]
 
 
@@ -84,7 +89,12 @@ def drape(
     if steps is not None:
         options = replace(options, steps=writer_names(steps))
     with _progress() as (bar, task):
-        report = run_job(job, out, options=options, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        report = run_job(
+            job,
+            out,
+            options=options,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
     _print_report(report, job, out)
 
 
@@ -123,7 +133,9 @@ def _device(device: Device) -> str:
 
 
 def _print_report(report: dict[str, Any], job: "ShotJob", out: Path) -> None:
-    table = Table("layer", "in body % (max)", "in layers beneath % (max)", "crossing pairs (max)", "strain p99 (max)")
+    table = Table(
+        "layer", "in body % (max)", "in layers beneath % (max)", "crossing pairs (max)", "strain p99 (max)"
+    )
     for layer in report["layers"]:
         row = report["summary"]["final"][layer["name"]]
         table.add_row(
@@ -148,7 +160,13 @@ def _progress() -> Any:
 
     @contextmanager
     def running() -> Any:
-        columns = (TextColumn("draping"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"), TimeRemainingColumn())
+        columns = (
+            TextColumn("draping"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            TimeRemainingColumn(),
+        )
         with Progress(*columns, console=out_console) as bar:
             yield bar, bar.add_task("draping", total=None)
 

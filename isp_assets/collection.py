@@ -35,10 +35,12 @@ FILE_NAME = "collection.toml"
 DEFAULT_FOLDER = Path(__file__).parent / "data" / "collection"
 
 _KEYS = {
-    "schema": str, "version": int, "name": str, "body_sha256": str, "skin": str, "layering": str, "garments": dict,
+    "schema": str, "version": int, "name": str, "body_sha256": str, "skin": str, "layering": str,
+    "garments": dict,
 }  # fmt: skip
 _GARMENT_KEYS = {
-    "bundle": str, "code": str, "color": str, "fabric": str, "accent": str, "scale": (int, float), "about": str,
+    "bundle": str, "code": str, "color": str, "fabric": str, "accent": str, "scale": (int, float),
+    "about": str,
 }  # fmt: skip
 
 
@@ -78,7 +80,11 @@ class Collection:
         table = read_toml(path, CollectionError)
         _check_head(table, path)
         entries = {name: _entry(name, row, path) for name, row in table["garments"].items()}
-        for file in {table["skin"], table.get("layering", table["skin"]), *(e.bundle for e in entries.values())}:
+        for file in {
+            table["skin"],
+            table.get("layering", table["skin"]),
+            *(e.bundle for e in entries.values()),
+        }:
             if not (folder / file).is_file():
                 raise CollectionError(f"{path}: names the file {file!r}, which is not in {folder}")
         return cls(folder, table["name"], table["body_sha256"], entries, table["skin"], table.get("layering"))
@@ -95,7 +101,11 @@ class Collection:
         """
         if name not in self.entries:
             near = difflib.get_close_matches(name, self.entries, n=3)
-            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it has: {', '.join(self.entries)}"
+            hint = (
+                f"did you mean {' or '.join(map(repr, near))}?"
+                if near
+                else f"it has: {', '.join(self.entries)}"
+            )
             raise CollectionError(f"collection {self.name!r} has no garment {name!r}; {hint}")
         return self.entries[name]
 
@@ -146,17 +156,25 @@ class Collection:
     def _check_body(self, file: str, sha256: str) -> None:
         if sha256 != self.body_sha256:
             raise CollectionError(
-                f"{self.folder / file}: trained on body {sha256[:12]}, but the collection {self.name!r} is for body "
-                f"{self.body_sha256[:12]}; put the bundle into a collection of its own body, or retrain it"
+                f"{self.folder / file}: trained on body {sha256[:12]}, but collection {self.name!r} "
+                f"is for body {self.body_sha256[:12]}; put the bundle into a collection of its own body, or retrain it"
             )
 
 
 def _check_head(table: dict[str, Any], path: Path) -> None:
-    check_keys(table, _KEYS, {"schema", "version", "name", "body_sha256", "skin", "garments"}, str(path), CollectionError)
+    check_keys(
+        table,
+        _KEYS,
+        {"schema", "version", "name", "body_sha256", "skin", "garments"},
+        str(path),
+        CollectionError,
+    )
     if table["schema"] != SCHEMA:
         raise CollectionError(f"{path}: schema must be {SCHEMA!r}, got {table['schema']!r}")
     if table["version"] != VERSION:
-        raise CollectionError(f"{path}: version {table['version']} is not known here, only {VERSION}; update isp-assets")
+        raise CollectionError(
+            f"{path}: version {table['version']} is not known here, only {VERSION}; update isp-assets"
+        )
     if not table["garments"]:
         raise CollectionError(f"{path}: the collection lists no garments")
 
@@ -166,7 +184,12 @@ def _entry(name: str, row: object, path: Path) -> Entry:
     if not isinstance(row, dict):
         raise CollectionError(f"{where}: must be a table, got {type(row).__name__}")
     check_keys(row, _GARMENT_KEYS, {"bundle"}, where, CollectionError)
-    style = {"color": row.get("color"), "kind": row.get("fabric"), "accent": row.get("accent"), "scale": row.get("scale")}
+    style = {
+        "color": row.get("color"),
+        "kind": row.get("fabric"),
+        "accent": row.get("accent"),
+        "scale": row.get("scale"),
+    }
     try:
         fabric = FabricStyle.from_text(**{k: v for k, v in style.items() if v is not None})
     except ValueError as cause:

@@ -55,7 +55,9 @@ class FrameRange:
         """
         match = _RANGE.match(text.strip())
         if match is None:
-            raise MotionError(f"not a frame range: {text!r}; expected START-END or START-ENDxSTEP, as in 1001-1096x2")
+            raise MotionError(
+                f"not a frame range: {text!r}; expected START-END or START-ENDxSTEP, as in 1001-1096x2"
+            )
         start, end, step = match.groups()
         return cls(int(start), int(end if end is not None else start), int(step or 1))
 

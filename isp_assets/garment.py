@@ -28,7 +28,7 @@ class Panel:
     st: Float[np.ndarray, "P 2"]
     """Texture coordinates in 0..1; the two panels do not overlap in the texture."""
     border_label: Int[np.ndarray, " P"]
-    """Edge label of a border point, 0 for an interior point. A corner carries the label of the edge it starts."""
+    """Edge label of a border point, 0 for an interior point. A corner carries that of the edge it starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +63,14 @@ class Garment:
 
     def __post_init__(self) -> None:
         if tuple(self.panels) != PANELS:
-            raise GarmentError(f"garment {self.name!r}: panels must be {PANELS} in this order, got {tuple(self.panels)}")
+            raise GarmentError(
+                f"garment {self.name!r}: panels must be {PANELS} in this order, got {tuple(self.panels)}"
+            )
         if not np.isfinite(self.rest_vertices).all():
-            raise GarmentError(f"garment {self.name!r}: rest vertices hold NaN or infinity; the code lies outside the trained range")
+            raise GarmentError(
+                f"garment {self.name!r}: rest vertices hold NaN or infinity; "
+                "the code lies outside the trained range"
+            )
         used = np.zeros(self.num_vertices, bool)
         for side, panel in self.panels.items():
             self._check_panel(side, panel)
@@ -73,9 +78,14 @@ class Garment:
         if not used.all():
             raise GarmentError(f"garment {self.name!r}: {int((~used).sum())} vertices belong to no face")
         for seam in self.seams:
-            front, back = (self.panels[s].vertex_index[i] for s, i in zip(PANELS, (seam.front, seam.back), strict=True))
+            front, back = (
+                self.panels[s].vertex_index[i] for s, i in zip(PANELS, (seam.front, seam.back), strict=True)
+            )
             if not np.array_equal(front, back):
-                raise GarmentError(f"garment {self.name!r}: seam {seam.labels} is not sewn: its panel points have different vertices")
+                raise GarmentError(
+                    f"garment {self.name!r}: seam {seam.labels} is not sewn: "
+                    "its panel points have different vertices"
+                )
 
     def _check_panel(self, side: str, panel: Panel) -> None:
         where = f"garment {self.name!r}, {side} panel"
@@ -84,7 +94,9 @@ class Garment:
             ("vertex_index", panel.vertex_index, self.num_vertices),
         ):
             if index.size and (index.min() < 0 or index.max() >= limit):
-                raise GarmentError(f"{where}: {what} must lie in 0..{limit - 1}, got {index.min()}..{index.max()}")
+                raise GarmentError(
+                    f"{where}: {what} must lie in 0..{limit - 1}, got {index.min()}..{index.max()}"
+                )
         corners = panel.vertex_index[panel.faces]
         if (corners == np.roll(corners, 1, axis=1)).any():
             raise GarmentError(f"{where}: a face uses one vertex twice; the sewing folded it away")

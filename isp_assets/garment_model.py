@@ -41,7 +41,9 @@ class GarmentModel:
     def __post_init__(self) -> None:
         for what, networks in (("panel_fields", self.panel_fields), ("atlases", self.atlases)):
             if tuple(networks) != PANELS:
-                raise BundleError(f"category {self.category!r}: {what} must be keyed {PANELS}, got {tuple(networks)}")
+                raise BundleError(
+                    f"category {self.category!r}: {what} must be keyed {PANELS}, got {tuple(networks)}"
+                )
         sizes = {net.config.code_size for net in (*self.panel_fields.values(), *self.atlases.values())}
         if len(sizes) != 1:
             raise BundleError(f"category {self.category!r}: networks disagree on the code size: {sorted(sizes)}")

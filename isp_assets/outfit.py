@@ -40,7 +40,8 @@ class Outfit:
             if item.bundle.body_sha256 != self.skin.body_sha256:
                 raise OutfitError(
                     f"garment {item.name!r} (bundle {item.bundle.category!r}) was trained on body "
-                    f"{item.bundle.body_sha256[:12]}, but the skin field on body {self.skin.body_sha256[:12]}; "
+                    f"{item.bundle.body_sha256[:12]}, "
+                    f"but the skin field on body {self.skin.body_sha256[:12]}; "
                     "take both from one collection, or train them on one body"
                 )
 

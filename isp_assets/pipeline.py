@@ -58,7 +58,11 @@ def run_job(
     started = time.perf_counter()
     writers = {name: make_writer(name) for name in job.write}
     clock: dict[str, float] = {}
-    draped = drape(job.outfit, job.shot, replace(options, resolution=job.resolution, keep_stages=measure_stages_every > 0))
+    draped = drape(
+        job.outfit,
+        job.shot,
+        replace(options, resolution=job.resolution, keep_stages=measure_stages_every > 0),
+    )
     clock["prepare"] = time.perf_counter() - started
     paths = {name: out / f"{job.shot.name}{writer.suffix}" for name, writer in writers.items()}
     _check_paths(paths)
@@ -162,7 +166,9 @@ def _report(
         "machine": _machine(options.device),
         "seconds": {stage: round(s, 4) for stage, s in clock.items()},
         "milliseconds_per_frame": {
-            stage: round(1000 * s / count, 2) for stage, s in clock.items() if stage not in ("prepare", "total")
+            stage: round(1000 * s / count, 2)
+            for stage, s in clock.items()
+            if stage not in ("prepare", "total")
         },
         "peak_memory_mib": round(_peak_memory_mib(), 1),
         "summary": summarise(rows),

@@ -106,7 +106,9 @@ def _load_file(file: Path) -> FoundPlugin:
 
 
 def _checked(name: str, origin: str, writer: type) -> FoundPlugin:
-    missing = [m for m in ("name", "suffix", "version", "begin", "add", "finish", "abort") if not hasattr(writer, m)]
+    missing = [
+        m for m in ("name", "suffix", "version", "begin", "add", "finish", "abort") if not hasattr(writer, m)
+    ]
     if missing:
         raise TypeError(f"{writer!r} lacks {', '.join(missing)}; see ShotWriter")
     return FoundPlugin(getattr(writer, "name", name), origin, writer.version, writer=writer)

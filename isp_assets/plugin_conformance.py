@@ -9,6 +9,7 @@ Every rule is a function of its own, so that a failure names the rule that broke
 """
 
 import hashlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def check_attributes(make: MakeWriter, folder: Path, shot: SyntheticShot) -> Non
     writer = make()
     assert isinstance(writer, ShotWriter), f"{writer!r} lacks attributes of ShotWriter"
     assert writer.name.isidentifier(), f"name {writer.name!r} must be one plain word"
-    assert writer.suffix[:1] == "." and writer.suffix[1:], f"suffix {writer.suffix!r} must look like '.abc'"
+    assert re.fullmatch(r"\.\w+", writer.suffix), f"suffix {writer.suffix!r} must look like '.abc'"
     assert writer.version, "version must say which file library is behind the writer"
     assert not list(folder.iterdir()), "making a writer must write nothing"
 

@@ -52,7 +52,9 @@ class Shot:
     def __post_init__(self) -> None:
         count = self.body.shape_dirs.shape[-1]
         if len(self.betas) > count:
-            raise ShotError(f"shot {self.name!r}: body {self.body.name!r} has {count} betas, got {len(self.betas)}")
+            raise ShotError(
+                f"shot {self.name!r}: body {self.body.name!r} has {count} betas, got {len(self.betas)}"
+            )
         if not np.isfinite(self.betas).all():
             raise ShotError(f"shot {self.name!r}: betas hold NaN or infinity: {self.betas.tolist()}")
 
@@ -69,12 +71,15 @@ class ShotJob:
     def __post_init__(self) -> None:
         if not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
             raise ShotError(
-                f"shot {self.shot.name!r}: resolution must lie in {MIN_RESOLUTION}..{MAX_RESOLUTION}, got {self.resolution}"
+                f"shot {self.shot.name!r}: resolution must lie in {MIN_RESOLUTION}..{MAX_RESOLUTION}, "
+                f"got {self.resolution}"
             )
         if self.shot.body.sha256 != self.outfit.body_sha256:
             raise ShotError(
-                f"shot {self.shot.name!r}: body {self.shot.body.name!r} ({self.shot.body.sha256[:12]}) is not the body that "
-                f"the outfit was trained on ({self.outfit.body_sha256[:12]}); use that body, or train a collection on yours"
+                f"shot {self.shot.name!r}: body {self.shot.body.name!r} ({self.shot.body.sha256[:12]}) "
+                "is not the body that "
+                f"the outfit was trained on ({self.outfit.body_sha256[:12]}); use that body, "
+                "or train a collection on yours"
             )
 
     @classmethod
@@ -115,14 +120,22 @@ def _motion(table: Mapping[str, Any], folder: Path, frames: FrameRange | None) -
     motion = Motion.load(_source(table["motion"], builtin_motions(), folder))
     if "fps" in table and float(table["fps"]) != motion.fps:
         motion = motion.resample(float(table["fps"]))
-    wanted = frames if frames is not None else FrameRange.parse(str(table["frames"])) if "frames" in table else None
+    wanted = (
+        frames
+        if frames is not None
+        else FrameRange.parse(str(table["frames"]))
+        if "frames" in table
+        else None
+    )
     return motion if wanted is None else motion.select(wanted)
 
 
 def _betas(value: str | list[Any], where: str) -> Float[np.ndarray, " B"]:
     if isinstance(value, str):
         if value not in BETA_PRESETS:
-            raise ShotError(f"{where}: betas must be a list of numbers or one of {', '.join(BETA_PRESETS)}; got {value!r}")
+            raise ShotError(
+                f"{where}: betas must be a list of numbers or one of {', '.join(BETA_PRESETS)}; got {value!r}"
+            )
         return np.asarray(BETA_PRESETS[value], np.float32)
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
         raise ShotError(f"{where}: betas must be numbers, got {value!r}")

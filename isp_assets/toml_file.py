@@ -29,7 +29,11 @@ def read_toml(path: Path, error: type[InputError]) -> dict[str, Any]:
 
 
 def check_keys(
-    table: Mapping[str, Any], expected: Mapping[str, type | tuple[type, ...]], required: set[str], where: str, error: type[InputError]
+    table: Mapping[str, Any],
+    expected: Mapping[str, type | tuple[type, ...]],
+    required: set[str],
+    where: str,
+    error: type[InputError],
 ) -> None:
     """Check the keys and value types of one table.
 

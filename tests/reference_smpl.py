@@ -32,3 +32,20 @@ def pose_reference(body, pose, betas, translation):
         rigid = (corrected - rest_joints[joint]) @ turn[joint].T + joints[joint]
         vertices += np.asarray(body.weights[:, joint], dtype=np.float64)[:, None] * rigid
     return vertices + translation, np.stack(joints) + translation
+
+
+def tiny_smpl_arrays(vertices=40, betas=4, seed=0):
+    """The arrays of a random body in SMPL's format, small enough for gradient checks; float64."""
+    rng = np.random.default_rng(seed)
+    weights = rng.random((vertices, 24)) ** 4
+    regressor = rng.random((24, vertices)) ** 4
+    parents = [4294967295, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
+    return {
+        "v_template": rng.normal(size=(vertices, 3)),
+        "f": rng.integers(0, vertices, (2 * vertices, 3)).astype(np.uint32),
+        "shapedirs": 0.1 * rng.normal(size=(vertices, 3, betas)),
+        "posedirs": 0.01 * rng.normal(size=(vertices, 3, 207)),
+        "J_regressor": regressor / regressor.sum(1, keepdims=True),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "kintree_table": np.array([parents, range(24)]),
+    }
