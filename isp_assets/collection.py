@@ -157,7 +157,8 @@ class Collection:
         if sha256 != self.body_sha256:
             raise CollectionError(
                 f"{self.folder / file}: trained on body {sha256[:12]}, but collection {self.name!r} "
-                f"is for body {self.body_sha256[:12]}; put the bundle into a collection of its own body, or retrain it"
+                f"is for body {self.body_sha256[:12]}; "
+                "put the bundle into a collection of its own body, or retrain it"
             )
 
 
