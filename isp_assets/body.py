@@ -28,14 +28,15 @@ _DEFAULT_FILE = Path(__file__).parent / "data" / "default_body.npz"
 _JOINTS = len(JOINT_NAMES)
 _POSE_FEATURES = 9 * (_JOINTS - 1)
 _NO_PARENT = 4294967295  # how SMPL files write -1: the root's parent, wrapped round to 32 unsigned bits
-_KEYS = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table")
+_REAL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights")
+_KEYS = (*_REAL_KEYS, "f", "kintree_table")
 
 BETA_PRESETS: dict[str, list[float]] = {
     "man": [0.95, 1.05, -0.60, 0.05, -0.13, -0.14, -0.43, -0.55, -1.22, 0.16],
     "woman": [-0.77, -0.72, 0.02, -0.05, -0.72, -0.29, 0.36, 0.95, 0.49, 0.63],
     "neutral": [0.0] * 10,
 }
-"""Shape coefficients of the default body: a man of 1.76 m, a woman of 1.63 m, the mean of 1.69 m."""
+"""Shape coefficients of the default body: a man of 1.77 m, a woman of 1.63 m, the mean of 1.69 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,8 @@ class Body:
                 f"betas: body '{self.name}' has {self.shape_dirs.shape[-1]} shape coefficients, got {count}; "
                 "pass no more than the body has (betas belong to one body file)"
             )
-        return self.template + torch.einsum("...b,ncb->...nc", betas.to(self.template), self.shape_dirs[..., :count])
+        directions = self.shape_dirs[..., :count]
+        return self.template + torch.einsum("...b,ncb->...nc", betas.to(self.template), directions)
 
     def pose(
         self,
@@ -188,10 +190,11 @@ def _check_pose_arguments(poses: Tensor, betas: Tensor | None, translation: Tens
             "reshape [T, 72] with .reshape(-1, 24, 3)"
         )
     frames = poses.shape[0]
-    if betas is not None and (betas.ndim not in (1, 2) or (betas.ndim == 2 and betas.shape[0] not in (1, frames))):
+    if betas is not None and tuple(betas.shape[:-1]) not in ((), (1,), (frames,)):
         raise BodyError(f"betas: expected [K] or [{frames}, K] for {frames} frames, got {list(betas.shape)}")
     if translation is not None and tuple(translation.shape) != (frames, 3):
-        raise BodyError(f"translation: expected [{frames}, 3] for {frames} frames, got {list(translation.shape)}")
+        got = list(translation.shape)
+        raise BodyError(f"translation: expected [{frames}, 3] for {frames} frames, got {got}")
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -202,7 +205,7 @@ def _read(path: Path) -> Mapping[str, Any]:
             with np.load(path, allow_pickle=False) as data:
                 return {key: data[key] for key in data.files}
         except (ValueError, OSError) as error:
-            raise BodyError(f"{path}: not a readable .npz of plain arrays ({error}); download it again") from error
+            raise BodyError(f"{path}: not a readable .npz of plain arrays ({error})") from error
     if path.suffix == ".pkl":
         return read_smpl_pickle(path, _KEYS)
     raise BodyError(f"{path}: expected a file ending in .npz or .pkl, got '{path.suffix}'")
@@ -216,8 +219,11 @@ def _from_arrays(data: Mapping[str, Any], *, name: str, where: str) -> Body:
             f"{where}: expected the SMPL keys {', '.join(_KEYS)}; missing {', '.join(missing)}; "
             f"found {', '.join(sorted(data)) or 'nothing'}"
         )
+    for key in _KEYS:
+        if np.asarray(data[key]).dtype.kind not in "fiu":
+            raise BodyError(f"{where}: {key}: expected numbers, got type {np.asarray(data[key]).dtype}")
     # Adding 0 turns -0 into 0, which is equal but would change the digest.
-    real = {key: np.ascontiguousarray(data[key], dtype=np.float32) + 0 for key in _KEYS if key not in ("f", "kintree_table")}
+    real = {key: np.ascontiguousarray(data[key], dtype=np.float32) + 0 for key in _REAL_KEYS}
     faces = np.ascontiguousarray(data["f"]).astype(np.int64)
     tree = np.asarray(data["kintree_table"]).astype(np.int64)
     if tree.ndim != 2 or tree.shape[1] != _JOINTS:
@@ -261,12 +267,19 @@ def _check(body: Body) -> None:
         if field != "faces" and not torch.isfinite(getattr(body, field)).all():
             raise BodyError(f"body '{body.name}': {field}: holds NaN or infinity; the file is damaged")
     if body.parents != tuple(JOINT_PARENTS):
-        raise BodyError(f"body '{body.name}': parents: expected SMPL's joint tree {list(JOINT_PARENTS)}, got {list(body.parents)}")
-    if body.faces.numel() and not (0 <= int(body.faces.min()) and int(body.faces.max()) < count):
-        low, high = int(body.faces.min()), int(body.faces.max())
-        raise BodyError(f"body '{body.name}': faces: expected vertex numbers in 0..{count - 1}, got {low}..{high}")
+        raise BodyError(
+            f"body '{body.name}': parents: expected SMPL's joint tree {list(JOINT_PARENTS)}, "
+            f"got {list(body.parents)}"
+        )
+    low, high = (int(body.faces.min()), int(body.faces.max())) if body.faces.numel() else (0, 0)
+    if low < 0 or high >= count:
+        raise BodyError(
+            f"body '{body.name}': faces: expected vertex numbers in 0..{count - 1}, got {low}..{high}"
+        )
     deviation = (body.weights.double().sum(1) - 1).abs()
     if bool((deviation > 1e-2).any()):
         worst = int(deviation.argmax())
         total = float(body.weights[worst].sum())
-        raise BodyError(f"body '{body.name}': weights: every row must sum to 1; row {worst} sums to {total:g}")
+        raise BodyError(
+            f"body '{body.name}': weights: expected rows that sum to 1; row {worst} sums to {total:g}"
+        )

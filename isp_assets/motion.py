@@ -23,7 +23,7 @@ _RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps")
 _BODY_JOINTS = 22  # pelvis to wrists: the joints that SMPL, SMPL-H and SMPL-X share, in one order
 _SMPL_PELVIS = (0.0, -0.22, 0.03)
 # Where the pelvis joint rests in each model [m], by the number of pose columns. The root turns about this
-# point, so a change of axes or of model moves the translation with it; shape changes it by a centimetre or so.
+# point, so a change of axes or of model moves the translation with it. Shape moves it by a centimetre or so.
 _REST_PELVIS = {72: _SMPL_PELVIS, 66: _SMPL_PELVIS, 156: _SMPL_PELVIS, 165: (0.0, -0.35, 0.01)}
 _Y_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -135,7 +135,8 @@ def builtin_motions() -> tuple[str, ...]:
 def _read(path: Path) -> Mapping[str, Any]:
     if not path.is_file():
         raise MotionError(
-            f"{path}: no such motion; expected the path of an .npz file or one of: {', '.join(builtin_motions())}"
+            f"{path}: no such motion; expected the path of an .npz file or one of: "
+            f"{', '.join(builtin_motions())}"
         )
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -156,7 +157,7 @@ def _from_arrays(data: Mapping[str, Any], *, up: str, name: str, where: str) -> 
         raise MotionError(f"{where}: trans: expected shape [{count}, 3], got {list(translation.shape)}")
     rate = next((data[key] for key in _RATE_KEYS if key in data), None)
     if rate is None:
-        raise MotionError(f"{where}: expected the frame rate under one of {', '.join(_RATE_KEYS)}; none is there")
+        raise MotionError(f"{where}: expected the frame rate under {' or '.join(_RATE_KEYS)}; none is there")
     if np.size(rate) != 1 or not np.issubdtype(np.asarray(rate).dtype, np.number):
         raise MotionError(f"{where}: frame rate: expected one number, got {rate!r}")
     full = np.zeros((count, len(JOINT_NAMES), 3))
@@ -176,9 +177,11 @@ def _pose_columns(data: Mapping[str, Any], where: str) -> tuple[Float[np.ndarray
         if poses.ndim == 3 and poses.shape[2] == 3:
             poses = poses.reshape(len(poses), -1)
     elif "root_orient" in data and "pose_body" in data:
-        poses = np.concatenate([np.asarray(data["root_orient"]), np.asarray(data["pose_body"])], 1).astype(np.float64)
+        poses = np.concatenate([data["root_orient"], data["pose_body"]], axis=1, dtype=np.float64)
     else:
-        raise MotionError(f"{where}: expected the key 'poses', or 'root_orient' and 'pose_body'; neither is there")
+        raise MotionError(
+            f"{where}: expected the key 'poses', or 'root_orient' and 'pose_body'; found neither"
+        )
     if poses.ndim != 2 or poses.shape[1] not in _REST_PELVIS or len(poses) == 0:
         raise MotionError(
             f"{where}: poses: expected at least one row of 72 (SMPL), 156 (SMPL-H) or 165 (SMPL-X) columns, "
@@ -201,7 +204,10 @@ def _up_axis(data: Mapping[str, Any], root: Float[np.ndarray, "T 3"], where: str
 
 
 def _to_y_up(
-    root: Float[np.ndarray, "T 3"], translation: Float[np.ndarray, "T 3"], axis: str, pelvis: tuple[float, ...]
+    root: Float[np.ndarray, "T 3"],
+    translation: Float[np.ndarray, "T 3"],
+    axis: str,
+    pelvis: tuple[float, ...],
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]:
     """Turn the world, and move the translation from the source's rest pelvis to SMPL's."""
     if axis not in ("y", "z"):
@@ -224,7 +230,8 @@ def _check(motion: Motion) -> None:
         )
     if motion.translation.shape != (count, 3):
         raise MotionError(
-            f"motion '{motion.name}': translation: expected shape [{count}, 3], got {list(motion.translation.shape)}"
+            f"motion '{motion.name}': translation: expected shape [{count}, 3], "
+            f"got {list(motion.translation.shape)}"
         )
     if not (np.isfinite(motion.fps) and motion.fps > 0 and motion.frame_step >= 1):
         raise MotionError(

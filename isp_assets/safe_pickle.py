@@ -20,9 +20,15 @@ from scipy import sparse
 from isp_assets.errors import BodyError
 
 # The names that numpy, scipy and pickle itself write for plain arrays, under Python 2 and 3.
-_NUMPY_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray", "numpy.core.numeric", "numpy._core.numeric")
+_NUMPY_MODULES = [
+    f"numpy.{core}.{module}" for core in ("core", "_core") for module in ("multiarray", "numeric")
+]
 _KINDS = {
-    **{(module, name): name for module in _NUMPY_MODULES for name in ("_reconstruct", "_frombuffer", "scalar")},
+    **{
+        (module, name): name
+        for module in _NUMPY_MODULES
+        for name in ("_reconstruct", "_frombuffer", "scalar")
+    },
     ("numpy", "ndarray"): "ndarray",
     ("numpy", "dtype"): "dtype",
     **{
@@ -38,7 +44,9 @@ _KINDS = {
         for name in ("bytes", "bytearray", "object", "set")
     },
 }
-_RECONSTRUCTORS = {(module, name) for module in ("copyreg", "copy_reg") for name in ("_reconstructor", "__newobj__")}
+_RECONSTRUCTORS = {
+    (module, name) for module in ("copyreg", "copy_reg") for name in ("_reconstructor", "__newobj__")
+}
 _NUMBER_TYPE = re.compile(r"^[<>=|]?(b1|[iu][1248]|f[248])$")
 _MAX_ENTRIES = 200_000_000  # of one dense array: ten times the largest in any SMPL file
 _MAX_DEPTH = 16
@@ -106,8 +114,8 @@ class _Reader(pickle.Unpickler):
         kind = f"chumpy {name}" if module.split(".")[0] == "chumpy" else _KINDS.get((module, name))
         if kind is None:
             raise BodyError(
-                f"{self._where}: the pickle asks for '{module}.{name}', which no SMPL body needs; nothing was run. "
-                "Expected numpy arrays, scipy sparse matrices and chumpy arrays; do not open this file elsewhere"
+                f"{self._where}: the pickle asks for '{module}.{name}', which no SMPL body needs; expected "
+                "numpy, scipy.sparse and chumpy arrays. Nothing was run; do not open this file elsewhere"
             )
         return type("_Record", (_Record,), {"kind": kind})
 
@@ -136,7 +144,7 @@ def _resolve(value: Any, depth: int = 0) -> np.ndarray:
 
 
 def _resolve_chumpy(value: _Record, depth: int) -> np.ndarray:
-    """The numbers of a ``chumpy.ch.Ch`` (its ``x``) or of a ``chumpy.reordering.Select`` (``a`` at ``idxs``)."""
+    """The numbers of a chumpy ``Ch`` (its ``x``) or of a ``Select`` (``a`` at ``idxs``)."""
     state = value.state
     if not isinstance(state, dict):
         raise ValueError(f"{value.kind} without state")
@@ -156,8 +164,9 @@ def _resolve_sparse(value: _Record, depth: int) -> np.ndarray:
     shape = _checked_shape(state.get("_shape", state.get("shape")))
     data = _resolve(state["data"], depth)
     if value.kind == "coo":
-        row, column = state["coords"] if "coords" in state else (state["row"], state["col"])
-        return sparse.coo_matrix((data, (_resolve(row, depth), _resolve(column, depth))), shape=shape).toarray()
+        pair = state["coords"] if "coords" in state else (state["row"], state["col"])
+        row, column = (_resolve(index, depth) for index in pair)
+        return sparse.coo_matrix((data, (row, column)), shape=shape).toarray()
     make = sparse.csc_matrix if value.kind == "csc" else sparse.csr_matrix
     matrix = make((data, _resolve(state["indices"], depth), _resolve(state["indptr"], depth)), shape=shape)
     matrix.check_format(full_check=True)  # scipy's C code trusts the indices: check them before it runs

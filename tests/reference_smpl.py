@@ -22,7 +22,7 @@ def pose_reference(body, pose, betas, translation):
         for entry in range(9):
             direction = np.asarray(body.pose_dirs[..., 9 * (joint - 1) + entry], dtype=np.float64)
             corrected += difference[entry // 3, entry % 3] * direction
-    turn, joints = [rotations[0]], [rest_joints[0]]
+    turn, joints = [rotations[0]], [rest_joints[0] + translation]
     for joint in range(1, 24):
         parent = body.parents[joint]
         turn.append(turn[parent] @ rotations[joint])
@@ -31,7 +31,7 @@ def pose_reference(body, pose, betas, translation):
     for joint in range(24):
         rigid = (corrected - rest_joints[joint]) @ turn[joint].T + joints[joint]
         vertices += np.asarray(body.weights[:, joint], dtype=np.float64)[:, None] * rigid
-    return vertices + translation, np.stack(joints) + translation
+    return vertices, np.stack(joints)
 
 
 def tiny_smpl_arrays(vertices=40, betas=4, seed=0):

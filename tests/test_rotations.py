@@ -113,4 +113,6 @@ def test_batches_equal_single_calls():
     for i in range(2):
         for j in range(3):
             torch.testing.assert_close(batched[i, j], axis_angle_to_matrix(vectors[i, j]))
-            torch.testing.assert_close(matrix_to_axis_angle(batched)[i, j], matrix_to_axis_angle(batched[i, j]))
+            torch.testing.assert_close(
+                matrix_to_axis_angle(batched)[i, j], matrix_to_axis_angle(batched[i, j])
+            )
