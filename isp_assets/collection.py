@@ -23,9 +23,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from isp_assets.bake import FabricStyle
+from isp_assets.fabric_style import FabricStyle
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
-from isp_assets.errors import CollectionError
+from isp_assets.errors import CollectionError, InputError
 from isp_assets.outfit import Outfit, OutfitItem
 from isp_assets.toml_file import check_keys, read_toml
 
@@ -184,7 +184,7 @@ def _entry(name: str, row: object, path: Path) -> Entry:
     where = f"{path}: garment {name!r}"
     if not isinstance(row, dict):
         raise CollectionError(f"{where}: must be a table, got {type(row).__name__}")
-    check_keys(row, _GARMENT_KEYS, {"bundle"}, where, CollectionError)
+    check_keys(row, _GARMENT_KEYS, {"bundle", "color"}, where, CollectionError)
     style = {
         "color": row.get("color"),
         "kind": row.get("fabric"),
@@ -193,6 +193,6 @@ def _entry(name: str, row: object, path: Path) -> Entry:
     }
     try:
         fabric = FabricStyle.from_text(**{k: v for k, v in style.items() if v is not None})
-    except ValueError as cause:
+    except InputError as cause:
         raise CollectionError(f"{where}: {cause}") from cause
     return Entry(name, row["bundle"], row.get("code", name), fabric, row.get("about", ""))
