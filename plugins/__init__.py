@@ -1,0 +1,1 @@
+"""The writer plugins that ship with isp-assets, one small package each."""
