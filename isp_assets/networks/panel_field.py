@@ -75,3 +75,10 @@ class PanelField(nn.Module):
         entry = (xy * self.config.input_scale, code)
         hidden = self.shared(*entry)
         return self.distance(hidden, *entry)[..., 0], self.label(hidden, *entry)
+
+    def signed_distance(
+        self, xy: Float[Tensor, "*#batch 2"], code: Float[Tensor, "*#batch Z"]
+    ) -> Float[Tensor, "*batch"]:
+        """The distance alone, as `forward` gives it, without the cost of the labels."""
+        entry = (xy * self.config.input_scale, code)
+        return self.distance(self.shared(*entry), *entry)[..., 0]
