@@ -15,7 +15,7 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,9 @@ class Shot:
 
     name: str
     body: Body
-    betas: Float[np.ndarray, " B"]
     motion: Motion
+    betas: Float[np.ndarray, " B"] = field(default_factory=lambda: np.zeros(10, np.float32))
+    """Shape coefficients of ``body``, one set for the whole shot."""
 
     def __post_init__(self) -> None:
         count = self.body.shape_dirs.shape[-1]
@@ -107,7 +108,7 @@ class ShotJob:
         name = table.get("name", motion.name)
         if not name or any(c in name for c in '/\\:*?"<>|') or name.startswith("."):
             raise ShotError(f"{where}: name must be usable as a file name, got {name!r}")
-        shot = Shot(name, body, _betas(table.get("betas", "neutral"), where), motion)
+        shot = Shot(name, body, motion, _betas(table.get("betas", "neutral"), where))
         write = tuple(table.get("write", DEFAULT_WRITERS))
         return cls(shot, outfit, table.get("resolution", DEFAULT_RESOLUTION), write)
 
