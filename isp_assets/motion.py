@@ -36,7 +36,7 @@ class Motion:
     """Axis-angle rotation of each joint relative to its parent [rad]."""
     translation: Float[np.ndarray, "T 3"]
     """Root translation [m], Y up."""
-    fps: float
+    fps: float | int
     """Frame numbers per second."""
     start_frame: int = 1
     name: str = "motion"
@@ -74,12 +74,12 @@ class Motion:
         """Frame number of every sample."""
         return self.start_frame + self.frame_step * np.arange(len(self))
 
-    def resample(self, fps: float) -> "Motion":
+    def resample(self, fps: float | int) -> "Motion":
         """The same motion at another rate: rotations along the shortest arc, translations linearly.
 
         The first frame keeps its number; the last is the last that lies within the motion.
         """
-        if not fps > 0:
+        if not (np.isfinite(fps) and fps > 0):
             raise MotionError(f"motion '{self.name}': resample: fps must be above 0, got {fps:g}")
         rate = self.fps / self.frame_step
         last = len(self) - 1
