@@ -2,8 +2,8 @@
 
 from .camera import Camera
 from .render import RenderMesh, render_view
-from .writer import SheetWriter
+from .writer import SheetStyle, SheetWriter
 
 WRITER = SheetWriter
 
-__all__ = ["WRITER", "Camera", "RenderMesh", "SheetWriter", "render_view"]
+__all__ = ["WRITER", "Camera", "RenderMesh", "SheetStyle", "SheetWriter", "render_view"]

@@ -56,7 +56,7 @@ class View:
         return self.height / self.size[1]
 
     def rays(self, jitter: tuple[float, float]) -> Float[np.ndarray, "n 3"]:
-        """Directions from the eye through one point of every pixel, row by row from the top left; not unit."""
+        """Directions from the eye through one point of every pixel, row by row from the top left."""
         width, height = self.size
         x = (np.arange(width) + jitter[0] - width / 2) * self.metres_per_pixel
         y = (height / 2 - np.arange(height) - jitter[1]) * self.metres_per_pixel

@@ -6,20 +6,29 @@ from pathlib import Path
 import numpy as np
 import PIL
 from jaxtyping import Float
+from PIL import Image
 
 from isp_assets.errors import PluginError
+from isp_assets.files import published
 from isp_assets.frames import FrameChunk, Scene
 
-from ..publish import PartFile
 from .camera import Camera
 from .layout import compose_page
 from .render import RenderMesh, render_view
 
-COLUMNS = 6
-ROWS = (("front", 0.0), ("left side", 60.0), ("back", 180.0))
-"""Caption and yaw [degrees] of every row, relative to where the wearer faces."""
-CELL = (286, 350)
-"""Width and height of a picture in pixels."""
+
+@dataclass(frozen=True)
+class SheetStyle:
+    """How large and how fine a sheet is."""
+
+    columns: int = 6
+    """Frames shown, spread evenly over the range."""
+    cell: tuple[int, int] = (286, 350)
+    """Width and height of one picture in pixels."""
+    samples: int = 3
+    """Rays per pixel along each axis."""
+    rows: tuple[tuple[str, float], ...] = (("front", 0.0), ("left side", 60.0), ("back", 180.0))
+    """Caption and yaw [degrees] of every row, relative to where the wearer faces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +43,7 @@ class _Frame:
 
 
 class SheetWriter:
-    """Contact sheet of one shot as a PNG: frames spread over the range, from the front, the side and the back.
+    """Contact sheet of one shot as a PNG: frames spread over the range, from front, side and back.
 
     The camera turns with the wearer and keeps one scale over the shot.
     """
@@ -43,17 +52,16 @@ class SheetWriter:
     suffix = ".png"
     version = f"pillow {PIL.__version__}"
 
-    def __init__(self) -> None:
-        self._scene: Scene | None = None
-        self._file: PartFile | None = None
-        self._wanted: set[int] = set()
-        self._kept: list[_Frame] = []
+    def __init__(self, style: SheetStyle | None = None) -> None:
+        self._style = style or SheetStyle()
+        self.abort()
 
     def begin(self, path: Path, scene: Scene) -> None:
         """Choose the frames to keep."""
+        self.abort()
         numbers = list(scene.frames)
-        chosen = np.linspace(0, len(numbers) - 1, min(COLUMNS, len(numbers))).round().astype(int)
-        self._scene, self._file, self._kept = scene, PartFile(Path(path)), []
+        chosen = np.linspace(0, len(numbers) - 1, min(self._style.columns, len(numbers))).round().astype(int)
+        self._path, self._scene = Path(path), scene
         self._wanted = {numbers[k] for k in chosen}
 
     def add(self, chunk: FrameChunk) -> None:
@@ -71,38 +79,38 @@ class SheetWriter:
         Raises:
             PluginError: If frames of the sheet never came.
         """
-        if self._scene is None or self._file is None:
+        if self._scene is None:
             raise PluginError("sheet: finish was called before begin")
         missing = self._wanted - {frame.number for frame in self._kept}
         if missing:
             raise PluginError(
-                f"sheet: {self._file.path}: frames {sorted(missing)} were never added; the shot is cut short"
+                f"sheet: {self._path}: frames {sorted(missing)} were never added; the shot is cut short"
             )
-        with self._file as file:
-            page = self._draw(self._scene)
-            with file.open() as out:
-                page.save(out, format="PNG")
-            file.publish()
+        page = _draw(self._scene, self._kept, self._style)
+        with published(self._path) as part:
+            page.save(part, format="PNG")
+        self.abort()
 
     def abort(self) -> None:
-        """Forget everything; nothing was written."""
-        if self._file is not None:
-            self._file.discard()
-        self._scene, self._file, self._kept = None, None, []
+        """Forget everything; nothing is on the disk before ``finish``."""
+        self._path = Path()
+        self._scene: Scene | None = None
+        self._wanted: set[int] = set()
+        self._kept: list[_Frame] = []
 
-    def _draw(self, scene: Scene):
-        low = min(float(frame.points[:, 1].min()) for frame in self._kept)
-        cameras = _cameras(self._kept, [_heading(scene, frame) for frame in self._kept])
-        pictures = [
-            [
-                render_view(_meshes(scene, frame), camera=camera, size=CELL, ground=low)
-                for frame, camera in zip(self._kept, row, strict=True)
-            ]
-            for row in cameras
+
+def _draw(scene: Scene, frames: list[_Frame], style: SheetStyle) -> Image.Image:
+    ground = min(float(frame.points[:, 1].min()) for frame in frames)
+    pictures = [
+        [
+            render_view(_meshes(scene, f), camera=c, size=style.cell, samples=style.samples, ground=ground)
+            for f, c in zip(frames, row, strict=True)
         ]
-        title = f"{scene.name}    frames {scene.frames}    {scene.fps:g} fps"
-        captions = [str(frame.number) for frame in self._kept]
-        return compose_page(title, scene.layers, captions, [caption for caption, _ in ROWS], pictures)
+        for row in _cameras(scene, frames, style)
+    ]
+    title = f"{scene.name}    frames {scene.frames}    {scene.fps:g} fps"
+    captions = [str(frame.number) for frame in frames]
+    return compose_page(title, scene.layers, captions, [caption for caption, _ in style.rows], pictures)
 
 
 def _meshes(scene: Scene, frame: _Frame) -> list[RenderMesh]:
@@ -120,17 +128,18 @@ def _heading(scene: Scene, frame: _Frame) -> float:
     return float(np.degrees(np.arctan2(sine, cosine)))
 
 
-def _cameras(frames: list[_Frame], headings: list[float]) -> list[list[Camera]]:
+def _cameras(scene: Scene, frames: list[_Frame], style: SheetStyle) -> list[list[Camera]]:
     """A camera for every row and frame: centred on the wearer, at one height and scale."""
     bottom = min(float(frame.points[:, 1].min()) for frame in frames)
     top = max(float(frame.points[:, 1].max()) for frame in frames)
     height = 1.12 * (top - bottom)
-    targets = []
+    turns = []
     for frame in frames:
         low, high = frame.points.min(0), frame.points.max(0)
         x, _, z = (low + high) / 2
-        targets.append((float(x), (bottom + top) / 2, float(z)))
-        reach = np.linalg.norm((high - low)[[0, 2]])
-        height = max(height, 0.9 * float(reach) * CELL[1] / CELL[0])
-    turns = list(zip(headings, targets, strict=True))
-    return [[Camera(heading + yaw, 8.0, target, height) for heading, target in turns] for _, yaw in ROWS]
+        turns.append((_heading(scene, frame), (float(x), (bottom + top) / 2, float(z))))
+        reach = float(np.linalg.norm((high - low)[[0, 2]]))
+        height = max(height, 0.9 * reach * style.cell[1] / style.cell[0])
+    return [
+        [Camera(heading + yaw, 8.0, target, height) for heading, target in turns] for _, yaw in style.rows
+    ]
