@@ -85,9 +85,8 @@ def synthetic_garment(name: str, *, radius: float, columns: int = 9, rows: int =
         Seam((label, label), grid[:, column], grid[:, column]) for label, column in ((2, -1), (4, 0))
     )
     rest = np.concatenate([front, back[~sewn.ravel()]])
-    return Garment(
-        name, "tube", np.zeros(2, np.float32), rest, np.zeros((24, 3)), panels, seams, anchors=grid[-1]
-    )
+    top = np.union1d(grid[-1], back_index.reshape(grid.shape)[-1])
+    return Garment(name, "tube", np.zeros(2, np.float32), rest, np.zeros((24, 3)), panels, seams, anchors=top)
 
 
 def _rectangle_labels(rows: int, columns: int) -> Int[np.ndarray, " P"]:
