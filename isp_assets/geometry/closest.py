@@ -1,0 +1,178 @@
+"""Exact closest points on a triangle mesh, with a signed height.
+
+The sign comes from angle-weighted pseudonormals, which give the right side at
+faces, edges and vertices alike. On an open mesh a point whose closest point lies
+on the border has no side: ask ``on_border`` before using its sign.
+
+Positions are in metres, in one shared space. NumPy, one frame at a time; the
+connectivity is prepared once (`SurfaceTopology`) and reused over frames.
+
+Reference: Baerentzen and Aanaes, "Signed Distance Computation Using the Angle
+Weighted Pseudonormal", 2005.
+"""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.topology import edges
+
+_ON_FEATURE = 1e-7  # barycentric weight below which the closest point lies on an edge or a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTopology:
+    """Connectivity of a triangle mesh as closest-point queries need it; static over frames."""
+
+    faces: Int[np.ndarray, "F 3"]
+    edge_faces: Int[np.ndarray, "E 2"]
+    """Faces at each edge; the second is -1 on the border."""
+    face_edge: Int[np.ndarray, "F 3"]
+    """Edge opposite to each corner of a face."""
+    border_vertex: Bool[np.ndarray, " V"]
+    corner_start: Int[np.ndarray, " V_plus_1"]
+    corners: Int[np.ndarray, " C"]
+    """Corners (3 * face + k) around vertex ``v``: from ``corner_start[v]`` to ``corner_start[v + 1]``."""
+
+    @classmethod
+    def build(cls, faces: Int[np.ndarray, "F 3"], num_vertices: int) -> "SurfaceTopology":
+        """Prepare a mesh.
+
+        Raises:
+            GeometryError: If the mesh is empty, an index is out of range, or an edge has more than two faces.
+        """
+        if len(faces) == 0:
+            raise GeometryError("surface has no faces; closest points need at least one triangle")
+        if faces.min() < 0 or faces.max() >= num_vertices:
+            raise GeometryError(f"faces must index 0..{num_vertices - 1}, got {faces.min()}..{faces.max()}")
+        faces = np.ascontiguousarray(faces, np.int64)
+        mesh = edges(faces)
+        if mesh.num_faces.max() > 2:
+            raise GeometryError(f"surface has an edge with {mesh.num_faces.max()} faces, expected at most 2")
+        order = np.argsort(mesh.face_edge.reshape(-1), kind="stable")
+        first = np.searchsorted(mesh.face_edge.reshape(-1)[order], np.arange(len(mesh.vertices)))
+        edge_faces = np.full((len(mesh.vertices), 2), -1, np.int64)
+        edge_faces[:, 0] = order[first] // 3
+        double = mesh.num_faces == 2
+        edge_faces[double, 1] = order[first[double] + 1] // 3
+        border = np.zeros(num_vertices, bool)
+        border[mesh.vertices[~double]] = True
+        corners = np.argsort(faces.reshape(-1), kind="stable")
+        start = np.concatenate([[0], np.bincount(faces.reshape(-1), minlength=num_vertices).cumsum()])
+        opposite = np.roll(mesh.face_edge, -1, axis=1)
+        return cls(faces, edge_faces, opposite, border, start, corners)
+
+
+@dataclass(frozen=True, eq=False)
+class Closest:
+    """Closest points on a surface to P query points."""
+
+    point: Float[np.ndarray, "P 3"]
+    face: Int[np.ndarray, " P"]
+    weights: Float[np.ndarray, "P 3"]
+    """Barycentric weights of ``point`` in ``face``."""
+    normal: Float[np.ndarray, "P 3"]
+    """Unit pseudonormal of the surface at ``point``."""
+    height: Float[np.ndarray, " P"]
+    """Distance [m], negative on the inner side."""
+    on_border: Bool[np.ndarray, " P"]
+    """The closest point lies on the open border of the surface: the sign means nothing."""
+
+
+class ClosestQuery:
+    """A surface in one frame, ready for closest-point queries (a tree of boxes, built once, used often)."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], topology: SurfaceTopology) -> None:
+        if len(vertices) != len(topology.border_vertex):
+            count = len(topology.border_vertex)
+            raise GeometryError(f"surface has {count} vertices, got {len(vertices)} positions")
+        if not np.isfinite(vertices).all():
+            raise GeometryError("surface positions hold NaN or infinity; check the step before")
+        self.vertices = np.ascontiguousarray(vertices, np.float64)
+        self.topology = topology
+        self._tree = igl.AABB()
+        self._tree.init(self.vertices, topology.faces)
+        corner = self.vertices[topology.faces]
+        cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        self.face_normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+
+    def __call__(self, points: Float[np.ndarray, "P 3"]) -> Closest:
+        """Closest point, side and pseudonormal of every query point."""
+        if len(points) == 0:
+            empty = np.zeros((0, 3))
+            return Closest(empty, np.zeros(0, np.int64), empty, empty, np.zeros(0), np.zeros(0, bool))
+        points = np.ascontiguousarray(points, np.float64)
+        squared, face, closest = self._tree.squared_distance(self.vertices, self.topology.faces, points)
+        face, closest = face.reshape(-1).astype(np.int64), closest.reshape(-1, 3)  # igl gives C's long long
+        weights = _barycentric(closest, self.vertices[self.topology.faces[face]])
+        normal, on_border = self._pseudonormals(face, weights)
+        side = np.where(((points - closest) * normal).sum(1) < 0, -1.0, 1.0)
+        return Closest(closest, face, weights, normal, side * np.sqrt(squared), on_border)
+
+    def _pseudonormals(
+        self, face: Int[np.ndarray, " P"], weights: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+        topology = self.topology
+        zero = weights < _ON_FEATURE
+        zeros = zero.sum(1)
+        normal = self.face_normals[face]
+        on_border = np.zeros(len(face), bool)
+        on_edge = np.flatnonzero(zeros == 1)
+        edge = topology.face_edge[face[on_edge], zero[on_edge].argmax(1)]
+        pair = topology.edge_faces[edge]
+        on_border[on_edge] = pair[:, 1] < 0
+        across = np.where(pair[:, 0] == face[on_edge], pair[:, 1], pair[:, 0])
+        normal[on_edge] += np.where(across[:, None] >= 0, self.face_normals[across], 0)
+        on_vertex = np.flatnonzero(zeros == 2)
+        vertex = topology.faces[face[on_vertex], weights[on_vertex].argmax(1)]
+        on_border[on_vertex] = topology.border_vertex[vertex]
+        if len(on_vertex):
+            unique, inverse = np.unique(vertex, return_inverse=True)
+            normal[on_vertex] = self._vertex_normals(unique)[inverse.reshape(-1)]
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        flat = length[:, 0] < 1e-12  # a fold of 180 degrees: any side is as good, keep the face's
+        normal[flat] = self.face_normals[face[flat]]
+        return normal / np.where(flat[:, None], 1.0, length), on_border
+
+    def _vertex_normals(self, vertex: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """Angle-weighted sums of face normals, not normalised."""
+        topology = self.topology
+        start, stop = topology.corner_start[vertex], topology.corner_start[vertex + 1]
+        owner = np.repeat(np.arange(len(vertex)), stop - start)
+        place = np.arange(len(owner)) - np.repeat(np.cumsum(stop - start) - (stop - start), stop - start)
+        corner = topology.corners[np.repeat(start, stop - start) + place]
+        face, k = corner // 3, corner % 3
+        here, following, before = (self.vertices[topology.faces[face, (k + i) % 3]] for i in range(3))
+        a, b = following - here, before - here
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
+        weighted = self.face_normals[face] * angle[:, None]
+        return np.stack([np.bincount(owner, weighted[:, i], minlength=len(vertex)) for i in range(3)], axis=1)
+
+
+def signed_heights(
+    points: Float[np.ndarray, "T P 3"], surface: Float[np.ndarray, "T_s V 3"], topology: SurfaceTopology
+) -> Float[np.ndarray, "T P"]:
+    """Signed height [m] of points over a surface, frame by frame; NaN where its open border is closest."""
+    if len(points) != len(surface):
+        raise GeometryError(f"points have {len(points)} frames, the surface has {len(surface)}")
+    heights = np.empty(points.shape[:2])
+    for frame, (queries, vertices) in enumerate(zip(points, surface, strict=True)):
+        found = ClosestQuery(vertices, topology)(queries)
+        heights[frame] = np.where(found.on_border, np.nan, found.height)
+    return heights
+
+
+def _barycentric(
+    point: Float[np.ndarray, "P 3"], corner: Float[np.ndarray, "P 3 3"]
+) -> Float[np.ndarray, "P 3"]:
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    p = point - corner[:, 0]
+    aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
+    pa, pb = (p * a).sum(1), (p * b).sum(1)
+    area = np.maximum(aa * bb - ab * ab, 1e-30)
+    second = (bb * pa - ab * pb) / area
+    third = (aa * pb - ab * pa) / area
+    return np.stack([1 - second - third, second, third], axis=1).clip(0, 1)
