@@ -1,0 +1,246 @@
+"""From a latent code to a garment: cut the panels, sew them, lift them onto the rest body.
+
+The three steps are separate, so that a fit can cut and sew once, which fixes the
+topology, and differentiate the lift alone (Eq. 5).
+
+Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
+Implicit Sewing Patterns", NeurIPS 2023, Eqs. 1, 3 and 5.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.conventions import PANELS
+from isp_assets.errors import DecodeError, GarmentError, GeometryError
+from isp_assets.garment import Garment, Panel, Seam
+from isp_assets.garment_model import GarmentModel
+from isp_assets.geometry.edge_runs import EdgeRun, split_edges
+from isp_assets.geometry.outline import PlaneField, trace_outline
+from isp_assets.geometry.sewing import FlatPanel, SewnPanels, sew_panels
+from isp_assets.networks.panel_field import PanelField
+
+RESOLUTIONS = (32, 512)
+"""Coarsest and finest mesh: grid cells across a panel's square."""
+_OUTLINE_CELLS = 256
+"""Outlines are found on a grid at least this fine, so coarse and fine meshes have one shape."""
+_SLIVER = 0.06
+"""Longest edge that one panel may have and the other lack [network units]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CutPanels:
+    """Outlines of both panels as labelled edges [network units]."""
+
+    outlines: Mapping[str, tuple[tuple[EdgeRun, ...], ...]]
+    num_specks: int
+    """Tiny pieces and holes that were dropped."""
+    num_evaluations: int
+    """Grid points at which a panel field was evaluated."""
+    num_grid_points: int
+    """Points of the full grids."""
+
+
+@dataclass(frozen=True)
+class DecodeReport:
+    """What decoding cost, and what it had to mend."""
+
+    seconds: Mapping[str, float]
+    """Time of "cut", "sew" and "lift"."""
+    num_specks: int
+    evaluated_share: float
+    """Share of the grid points at which the panel fields were evaluated."""
+    seam_gap_mean: float
+    """Mean distance between the two sides of the seams before welding [m]."""
+    seam_gap_max: float
+
+
+def decode_garment(
+    model: GarmentModel, code: Float[np.ndarray, " Z"], *, resolution: int = 128, name: str = ""
+) -> Garment:
+    """Make the garment of a latent code.
+
+    Args:
+        model: Networks and pattern facts of the category.
+        code: Latent code.
+        resolution: Grid cells across a panel's square, 32 to 512; triangles have that side.
+        name: Name of the garment, for messages and files.
+
+    Raises:
+        DecodeError: If the code gives no valid garment.
+    """
+    return decode_with_report(model, code, resolution=resolution, name=name)[0]
+
+
+def decode_with_report(
+    model: GarmentModel, code: Float[np.ndarray, " Z"], *, resolution: int = 128, name: str = ""
+) -> tuple[Garment, DecodeReport]:
+    """As `decode_garment`, with figures.
+
+    Raises:
+        DecodeError: If the code gives no valid garment.
+    """
+    code = _check(model, code, resolution)
+    where = f"{model.category} {name!r}" if name else f"a {model.category}"
+    try:
+        times = [time.perf_counter()]
+        cut = cut_panels(model, code, resolution=resolution)
+        times.append(time.perf_counter())
+        sewn = sew_panels(cut.outlines, model.seam_pairs, spacing=2.0 / resolution, sliver=_SLIVER)
+        times.append(time.perf_counter())
+        with torch.no_grad():
+            lifted = lift_points(model, sewn, torch.from_numpy(code))
+            rest = weld_points(sewn, lifted).numpy()
+        times.append(time.perf_counter())
+        garment = _garment(model, sewn, code, rest, name)
+    except (GeometryError, GarmentError) as error:
+        raise DecodeError(
+            f"{where} cannot be decoded at resolution {resolution}: {error}; its code has norm "
+            f"{np.linalg.norm(code):.3g}. Use a code nearer to those of the garments in the bundle"
+        ) from error
+    gap = np.concatenate([
+        np.linalg.norm(lifted["front"].numpy()[s.front] - lifted["back"].numpy()[s.back], axis=1)
+        for s in sewn.seams
+    ] or [np.zeros(1)])  # fmt: skip
+    stages = dict(zip(("cut", "sew", "lift"), np.diff(times).tolist(), strict=True))
+    share = cut.num_evaluations / cut.num_grid_points
+    return garment, DecodeReport(stages, cut.num_specks, share, float(gap.mean()), float(gap.max()))
+
+
+def cut_panels(model: GarmentModel, code: Float[np.ndarray, " Z"], *, resolution: int) -> CutPanels:
+    """Find the labelled outlines of both panels: the topology of the garment.
+
+    Raises:
+        GeometryError: If a panel is missing, has a hole or leaves its square.
+    """
+    cells = max(_OUTLINE_CELLS, 1 << (resolution - 1).bit_length())
+    outlines, specks, evaluations = {}, 0, 0
+    for side in PANELS:
+        try:
+            outline = trace_outline(plane_field(model.panel_fields[side], code), cells=cells)
+        except GeometryError as error:
+            raise GeometryError(f"{side} panel: {error}") from error
+        loops = zip(outline.loops, outline.logits, strict=True)
+        outlines[side] = tuple(split_edges(points, logits) for points, logits in loops)
+        specks += outline.num_specks
+        evaluations += outline.num_evaluations
+    return CutPanels(outlines, specks, evaluations, len(PANELS) * (cells + 1) ** 2)
+
+
+def plane_field(network: PanelField, code: Float[np.ndarray, " Z"]) -> PlaneField:
+    """The panel of one code as functions of NumPy arrays [network units]."""
+    latent = torch.from_numpy(np.asarray(code, dtype=np.float32))
+
+    def distance(xy):
+        with torch.no_grad():
+            return network.signed_distance(_tensor(xy), latent).numpy().astype(np.float64)
+
+    def border(xy):
+        points = _tensor(xy).requires_grad_()
+        with torch.enable_grad():
+            value, logits = network(points, latent)
+            (gradient,) = torch.autograd.grad(value.sum(), points)
+        return tuple(t.detach().numpy().astype(np.float64) for t in (value, gradient, logits))
+
+    return PlaneField(distance, border)
+
+
+def lift_points(
+    model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *, follow_border: bool = False
+) -> dict[str, Float[Tensor, "P 3"]]:
+    """Map every panel point to the rest body [m] (Eq. 3); differentiable in the code.
+
+    Args:
+        model: The category's networks.
+        sewn: Flat panels [network units].
+        code: Latent code.
+        follow_border: Whether border points move with the zero level when the code
+            changes. Values stay the same; gradients are those of Eq. 5.
+    """
+    lifted = {}
+    for side, panel in sewn.panels.items():
+        xy = _tensor(panel.points)
+        if follow_border:
+            xy = _follow_border(model.panel_fields[side], panel, xy, code)
+        lifted[side] = model.atlases[side](xy, code)
+    return lifted
+
+
+def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) -> Float[Tensor, "V 3"]:
+    """Vertex positions: the mean of all panel points that share a vertex."""
+    index = torch.from_numpy(np.concatenate([p.vertex_index for p in sewn.panels.values()]))
+    points = torch.cat([lifted[side] for side in sewn.panels])
+    total = points.new_zeros(sewn.num_vertices, 3).index_add(0, index, points)
+    return total / torch.bincount(index, minlength=sewn.num_vertices)[:, None]
+
+
+def _follow_border(network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"]):
+    """``x - grad s (s(x, z) - s(x, z0)) / |grad s|^2`` on the border: zero at ``z0``, with the slope of Eq. 5."""
+    border = torch.from_numpy(np.flatnonzero(panel.border_label))
+    points = xy[border].detach().requires_grad_()
+    with torch.enable_grad():
+        value = network.signed_distance(points, code.detach())
+        (slope,) = torch.autograd.grad(value.sum(), points)
+    distance = network.signed_distance(xy[border], code)
+    step = slope / (slope**2).sum(dim=-1, keepdim=True).clamp_min(0.1)
+    return xy.index_add(0, border, -step * (distance - distance.detach())[:, None])
+
+
+def _check(model: GarmentModel, code: Float[np.ndarray, " Z"], resolution: int) -> Float[np.ndarray, " Z"]:
+    low, high = RESOLUTIONS
+    if not low <= resolution <= high:
+        raise DecodeError(f"resolution must lie in {low}..{high} cells, got {resolution}")
+    code = np.asarray(code, dtype=np.float32)
+    if code.shape != (model.code_size,):
+        raise DecodeError(f"a {model.category} code has {model.code_size} numbers, got shape {code.shape}")
+    if not np.isfinite(code).all():
+        raise DecodeError(f"the {model.category} code holds NaN or infinity")
+    return code
+
+
+def _garment(model: GarmentModel, sewn: SewnPanels, code: Float[np.ndarray, " Z"], rest, name: str) -> Garment:
+    anchors = [
+        panel.vertex_index[points]
+        for panel in sewn.panels.values()
+        for label, points in panel.runs
+        if label in model.anchor_labels
+    ]
+    return Garment(
+        name=name,
+        category=model.category,
+        code=code,
+        rest_vertices=rest,
+        rest_pose=model.rest_pose,
+        panels={side: _panel(model, side, panel) for side, panel in sewn.panels.items()},
+        seams=tuple(Seam(s.labels, s.front, s.back) for s in sewn.seams),
+        anchors=np.unique(np.concatenate([*anchors, np.empty(0, dtype=np.int64)])),
+    )
+
+
+def _panel(model: GarmentModel, side: str, panel: FlatPanel) -> Panel:
+    return Panel(
+        panel_xy=model.to_panel(panel.points).astype(np.float32),
+        faces=panel.faces,
+        vertex_index=panel.vertex_index,
+        st=texture_coordinates(side, panel.points).astype(np.float32),
+        border_label=panel.border_label,
+    )
+
+
+def texture_coordinates(side: str, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Place of network coordinates in the texture: the front is its left half, the back its right.
+
+    The texture is twice as wide as high. The back is mirrored: seen from behind,
+    the body's left is on the left, and writing must still read from left to right.
+    """
+    s = 0.25 * (xy[:, 0] + 1) if side == "front" else 1 - 0.25 * (xy[:, 0] + 1)
+    return np.stack([s, 0.5 * (xy[:, 1] + 1)], axis=1)
+
+
+def _tensor(xy: Float[np.ndarray, "n 2"]) -> Float[Tensor, "n 2"]:
+    return torch.from_numpy(np.asarray(xy, dtype=np.float32))
