@@ -1,0 +1,164 @@
+"""Triangulation of a flat panel: its outline, a regular lattice inside, Delaunay in between.
+
+The lattice is anchored at the origin and mirror-symmetric in x, so the front and
+the back of a garment share their inner points, and the left half mirrors the right.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import Delaunay, cKDTree
+
+from isp_assets.errors import GeometryError
+
+_CLEARANCE = 0.62
+"""Distance of lattice points from the outline, in spacings; nearer points make thin triangles."""
+
+
+def triangulate_panel(
+    loops: Sequence[Float[np.ndarray, "n 2"]], spacing: float
+) -> tuple[Float[np.ndarray, "P 2"], Int[np.ndarray, "F 3"]]:
+    """Fill closed outlines with triangles of side about ``spacing``.
+
+    Args:
+        loops: Closed polygons without a repeated end point [m], resampled at about
+            ``spacing``; separate pieces, none inside another.
+        spacing: Side of a lattice triangle [m].
+
+    Returns:
+        Points [m], of which the first are the loops' own in order, and faces,
+        counter-clockwise. Every loop edge is an edge of the result, and every point is used.
+
+    Raises:
+        GeometryError: If a loop has under three points, crosses itself, or cannot be filled.
+    """
+    if spacing <= 0 or not np.isfinite(spacing):
+        raise GeometryError(f"spacing must be a positive length in metres, got {spacing}")
+    if len(loops) == 0:
+        raise GeometryError("a panel needs at least one outline loop, got none")
+    num_border = sum(map(len, loops))
+    border, inner, faces, start, inner_start = [], [], [], 0, num_border
+    for number, loop in enumerate(loops):
+        lattice, triangles = _fill(np.asarray(loop, dtype=np.float64), spacing, where=f"outline loop {number}")
+        index = np.concatenate([start + np.arange(len(loop)), inner_start + np.arange(len(lattice))])
+        border.append(loop)
+        inner.append(lattice)
+        faces.append(index[triangles])
+        start, inner_start = start + len(loop), inner_start + len(lattice)
+    return np.concatenate([*border, *inner]).astype(np.float64), np.concatenate(faces)
+
+
+def points_in_polygon(points: Float[np.ndarray, "n 2"], loop: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " n"]:
+    """Tell which points lie inside a closed polygon, by the even-odd rule."""
+    inside = np.zeros(len(points), dtype=bool)
+    x, y = points[:, 0], points[:, 1]
+    for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+        if a[1] == b[1]:
+            continue
+        spans = (a[1] > y) != (b[1] > y)
+        inside ^= spans & (x < a[0] + (y - a[1]) / (b[1] - a[1]) * (b[0] - a[0]))
+    return inside
+
+
+def _fill(loop: Float[np.ndarray, "n 2"], spacing: float, *, where: str):
+    """Lattice points and faces of one loop; faces index the loop, then the lattice."""
+    if loop.ndim != 2 or loop.shape[1] != 2 or len(loop) < 3 or not np.isfinite(loop).all():
+        raise GeometryError(f"{where}: expected at least 3 finite points of shape [n, 2], got shape {loop.shape}")
+    lattice = _lattice_inside(loop, spacing)
+    points = np.concatenate([loop, lattice])
+    triangles = Delaunay(points).simplices.astype(np.int64)
+    triangles = _counter_clockwise(points, triangles)
+    missing = _missing_edges(triangles, len(loop))
+    for a, b in missing:
+        _recover_edge(points, triangles, a, b, where=where)
+    triangles = triangles[points_in_polygon(points[triangles].mean(axis=1), loop)]
+    triangles = triangles[_double_area(points, triangles) > 1e-6 * spacing**2]
+    _check_filled(points, triangles, loop, where=where)
+    return lattice, triangles
+
+
+def _lattice_inside(loop: Float[np.ndarray, "n 2"], spacing: float) -> Float[np.ndarray, "m 2"]:
+    low, high = loop.min(axis=0), loop.max(axis=0)
+    row_height = spacing * np.sqrt(3) / 2
+    rows = np.arange(np.floor(low[1] / row_height), np.ceil(high[1] / row_height) + 1)
+    columns = np.arange(np.floor(low[0] / spacing) - 1, np.ceil(high[0] / spacing) + 2)
+    column, row = np.meshgrid(columns, rows)
+    lattice = np.stack([(column + 0.5 * (np.abs(row) % 2)) * spacing, row * row_height], axis=-1).reshape(-1, 2)
+    lattice = lattice[points_in_polygon(lattice, loop)]
+    step = np.linspace(0, 1, 6)[:-1, None, None]
+    dense = (loop + step * (np.roll(loop, -1, axis=0) - loop)).reshape(-1, 2)
+    distance, _ = cKDTree(dense).query(lattice)
+    return lattice[distance > _CLEARANCE * spacing]
+
+
+def _double_area(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " F"]:
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+
+
+def _counter_clockwise(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F 3"]:
+    flipped = _double_area(points, faces) < 0
+    return np.where(flipped[:, None], faces[:, [0, 2, 1]], faces)
+
+
+def _missing_edges(faces: Int[np.ndarray, "F 3"], n: int) -> list[tuple[int, int]]:
+    present = {tuple(e) for e in np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1).tolist()}
+    return [(i, (i + 1) % n) for i in range(n) if tuple(sorted((i, (i + 1) % n))) not in present]
+
+
+def _crosses(p, q, a, b) -> bool:
+    """Whether the open segments pq and ab cross."""
+
+    def turn(u, v, w):
+        return (v[0] - u[0]) * (w[1] - u[1]) - (v[1] - u[1]) * (w[0] - u[0])
+
+    return turn(p, q, a) * turn(p, q, b) < 0 and turn(a, b, p) * turn(a, b, q) < 0
+
+
+def _recover_edge(points, faces, a: int, b: int, *, where: str) -> None:
+    """Flip edges that cross segment ab until ab is an edge (Sloan 1993); changes ``faces`` in place."""
+    for _ in range(200):
+        owners: dict[tuple[int, int], list[int]] = {}
+        for t, face in enumerate(faces.tolist()):
+            for k in range(3):
+                owners.setdefault(tuple(sorted((face[k], face[(k + 1) % 3]))), []).append(t)
+        if tuple(sorted((a, b))) in owners:
+            return
+        flipped = False
+        for (p, q), pair in owners.items():
+            if len(pair) != 2 or {a, b} & {p, q} or not _crosses(points[a], points[b], points[p], points[q]):
+                continue
+            r, s = (int(np.setdiff1d(faces[t], (p, q))[0]) for t in pair)
+            if not _crosses(points[p], points[q], points[r], points[s]):
+                continue  # the two triangles form no convex quadrilateral yet
+            still = _crosses(points[a], points[b], points[r], points[s])
+            if still and flipped:
+                continue
+            pair_faces = np.array([[r, s, p], [s, r, q]])
+            faces[pair] = _counter_clockwise(points, pair_faces)
+            flipped = True
+            break
+        if not flipped:
+            break
+    raise GeometryError(f"{where}: cannot keep the outline edge {a}-{b} near {points[a].round(4).tolist()}; does the outline cross itself?")
+
+
+def _check_filled(points, faces, loop, *, where: str) -> None:
+    """The border of the faces must be exactly the loop, and their area the polygon's."""
+    n = len(loop)
+    directed = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+    unique, inverse = np.unique(np.sort(directed, 1), axis=0, return_inverse=True)
+    border = unique[np.bincount(inverse.reshape(-1)) == 1]
+    expected = np.sort(np.stack([np.arange(n), (np.arange(n) + 1) % n], 1), 1)
+    expected = expected[np.lexsort((expected[:, 1], expected[:, 0]))]
+    if not np.array_equal(border, expected):
+        raise GeometryError(
+            f"{where}: the outline is not kept by its triangulation ({len(border)} border edges, expected {n}); "
+            "does the outline cross itself, or is it thinner than the spacing?"
+        )
+    following = np.roll(loop, -1, axis=0)
+    area = abs((loop[:, 0] * following[:, 1] - loop[:, 1] * following[:, 0]).sum())
+    filled = _double_area(points, faces).sum()
+    if abs(filled - area) > 1e-6 * area or len(np.unique(faces)) != len(points):
+        raise GeometryError(f"{where}: triangles cover {filled / 2:.6g} m^2 of {area / 2:.6g} m^2; does the outline cross itself?")

@@ -1,0 +1,1 @@
+"""Making the networks of a category: patterns, rest shapes, and training."""

@@ -1,0 +1,285 @@
+"""The training data: parametric garments draped to rest on a body, and their files.
+
+A data set is a folder::
+
+    dataset.json                    categories, labels, statistics, counted rejections
+    top/0000_tank_top.npz           one garment; arrays and a JSON text, nothing pickled
+
+Garments depend on (seed, category, index) alone, so a run that was cut off goes on
+where it stopped, with any number of workers. The first garments of a category are its
+named presets, the rest are random.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from isp_assets.conventions import PANELS
+from isp_assets.errors import DatasetError
+from isp_assets.train.garment_maker import CATEGORIES, FILE_VERSION, GarmentMaker, Recipe
+
+Progress = Callable[[int, int, str], None]
+
+_SCHEMA = "isp-assets/dataset"
+_VERSION = 1
+_POOL_RESTARTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPanel:
+    """One panel of a training garment."""
+
+    xy: Float[np.ndarray, "P 2"]
+    """Flat positions [m]; the outline's points come first."""
+    faces: Int[np.ndarray, "F 3"]
+    """Wound so that the sewn surface faces outwards: the front counter-clockwise in xy, the back clockwise."""
+    vertex_index: Int[np.ndarray, " P"]
+    """Garment vertex of each panel point."""
+    outline_xy: Float[np.ndarray, "M 2"]
+    """Dense samples of the outline, about 4 mm apart [m]."""
+    outline_label: Int[np.ndarray, " M"]
+    """Label of the edge from each sample to the next."""
+    outline_loop: Int[np.ndarray, " M"]
+    """Closed loop of each sample; an open front has two."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingGarment:
+    """A pattern and its rest shape."""
+
+    name: str
+    category: str
+    panels: Mapping[str, TrainingPanel]
+    rest_vertices: Float[np.ndarray, "V 3"]
+    """Positions on the body in the rest pose [m]."""
+    anchors: Int[np.ndarray, " A"]
+    """Vertices held by the body: the waist; may be empty."""
+    parameters: Mapping[str, float]
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentDataset:
+    """All training garments of a category, and what they share."""
+
+    category: str
+    garments: tuple[TrainingGarment, ...]
+    edge_names: Mapping[int, str]
+    seam_pairs: tuple[tuple[int, int], ...]
+    """Labels (front, back) of edges that are sewn together."""
+    anchor_labels: tuple[int, ...]
+    rest_pose: Float[np.ndarray, "24 3"]
+    """Axis-angle pose of the body that the rest shapes lie on [rad]."""
+    panel_center: Float[np.ndarray, " 2"]
+    panel_scale: float
+    """Network coordinates = (xy - panel_center) / panel_scale, within [-.95, .95]."""
+    body_sha256: str
+
+
+def make_dataset(
+    out: Path,
+    *,
+    counts: Mapping[str, int],
+    seed: int = 0,
+    body: str = "default",
+    workers: int = 2,
+    edge_length: float = 0.018,
+    progress: Progress | None = None,
+) -> None:
+    """Make or complete a data set.
+
+    Args:
+        out: Folder; garments of the same seed, body and edge length already there are kept.
+        counts: Garments per category ("top", "skirt", "trousers").
+        seed: Of the random garments.
+        body: ``"default"`` or an SMPL file.
+        workers: Processes, each with one thread; 1 works in this process.
+        edge_length: Triangle side [m].
+        progress: Called with (finished, total, message) after every garment.
+
+    Raises:
+        DatasetError: If a category is unknown, or ``out`` holds another data set.
+        MissingExtraError: If numba or ipctk is not installed.
+    """
+    out = Path(out)
+    unknown = set(counts) - set(CATEGORIES)
+    if unknown or not counts or min(counts.values()) < 1 or workers < 1:
+        raise DatasetError(f"expected counts >= 1 for categories among {sorted(CATEGORIES)} and workers >= 1, got {dict(counts)}, workers={workers}")
+    recipe = Recipe(out=str(out), seed=seed, body=str(body), edge_length=edge_length)
+    maker = GarmentMaker(recipe)
+    tasks = [(category, index) for category in CATEGORIES for index in range(counts.get(category, 0))]
+    missing = [task for task in tasks if not maker.is_made(*task)]
+    done = len(tasks) - len(missing)
+
+    def report(message: str) -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, len(tasks), message)
+
+    if workers == 1:
+        for task in missing:
+            report(maker.make(*task))
+    else:
+        _run_pool(recipe, missing, workers, report)
+    _write_index(out, recipe, maker, counts)
+
+
+def load_dataset(folder: Path, category: str) -> GarmentDataset:
+    """Read all garments of a category.
+
+    Raises:
+        DatasetError: If the folder holds no complete data set of this version, or lacks the category.
+    """
+    index = read_index(folder)
+    if category not in index["categories"]:
+        raise DatasetError(f"{folder} has no category {category!r}; it has {sorted(index['categories'])}")
+    shared = index["categories"][category]
+    return GarmentDataset(
+        category=category,
+        garments=tuple(_load_garment(Path(folder) / category / name) for name in shared["files"]),
+        edge_names={int(label): name for label, name in shared["edge_names"].items()},
+        seam_pairs=tuple((front, back) for front, back in shared["seam_pairs"]),
+        anchor_labels=tuple(shared["anchor_labels"]),
+        rest_pose=np.array(shared["rest_pose"]),
+        panel_center=np.array(shared["panel_center"]),
+        panel_scale=float(shared["panel_scale"]),
+        body_sha256=index["body_sha256"],
+    )
+
+
+def read_index(folder: Path) -> dict:
+    """The parsed ``dataset.json`` of a folder, its version checked.
+
+    Raises:
+        DatasetError: If it is missing, damaged or of another version.
+    """
+    path = Path(folder) / "dataset.json"
+    try:
+        index = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; the folder holds no complete data set, run make_dataset on it") from None
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}") from error
+    if (index.get("schema"), index.get("version")) != (_SCHEMA, _VERSION):
+        raise DatasetError(f"{path}: expected schema {_SCHEMA} version {_VERSION}, got {index.get('schema')} version {index.get('version')}")
+    return index
+
+
+def _load_garment(path: Path) -> TrainingGarment:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        meta = json.loads(str(arrays.pop("meta")))
+    except (OSError, ValueError, KeyError) as error:
+        raise DatasetError(f"{path} is missing or damaged ({error}); run make_dataset on the folder again") from error
+    if meta["version"] != FILE_VERSION:
+        raise DatasetError(f"{path}: expected version {FILE_VERSION}, got {meta['version']}; make the data set again")
+    fields = TrainingPanel.__dataclass_fields__
+    return TrainingGarment(
+        name=meta["name"],
+        category=meta["category"],
+        panels={side: TrainingPanel(**{name: arrays[f"{side}_{name}"] for name in fields}) for side in PANELS},
+        rest_vertices=arrays["rest_vertices"],
+        anchors=arrays["anchors"],
+        parameters=meta["parameters"],
+        metrics=meta["metrics"],
+    )
+
+
+def _run_pool(recipe: Recipe, tasks: list[tuple[str, int]], workers: int, report: Callable[[str], None]) -> None:
+    """Make garments in separate processes. A worker that dies loses its own garment at most; it is made again."""
+    remaining = dict.fromkeys(tasks)
+    for _ in range(_POOL_RESTARTS):
+        if not remaining:
+            return
+        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (recipe,)) as pool:
+            try:
+                with _ThreadsPinned():
+                    futures = {pool.submit(_make_in_worker, task): task for task in remaining}
+                for future in as_completed(futures):
+                    report(future.result())
+                    del remaining[futures[future]]
+            except BrokenProcessPool:
+                continue
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    if remaining:
+        raise DatasetError(f"worker processes died {_POOL_RESTARTS} times with {len(remaining)} garments to go; use fewer workers, or check the memory; finished garments are kept")
+
+
+_worker: GarmentMaker | None = None
+
+
+def _start_worker(recipe: Recipe) -> None:
+    global _worker
+    import torch
+
+    torch.set_num_threads(1)
+    _worker = GarmentMaker(recipe)
+
+
+def _make_in_worker(task: tuple[str, int]) -> str:
+    assert _worker is not None
+    return _worker.make(*task)
+
+
+class _ThreadsPinned:
+    """One thread per child process: BLAS reads these when it starts, and two pools of threads hinder each other."""
+
+    _names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+    def __enter__(self) -> None:
+        self._before = {name: os.environ.get(name) for name in self._names}
+        os.environ.update(dict.fromkeys(self._names, "1"))
+
+    def __exit__(self, *_: object) -> None:
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, counts: Mapping[str, int]) -> None:
+    categories = {}
+    for name, category in CATEGORIES.items():
+        if name not in counts:
+            continue
+        paths = [maker.path(name, index) for index in range(counts[name])]
+        metas = [maker.read_meta(path) for path in paths]
+        categories[name] = {
+            "files": [path.name for path in paths],
+            "edge_names": {str(label): text for label, text in category.edge_names.items()},
+            "seam_pairs": category.seam_pairs,
+            "anchor_labels": category.anchor_labels,
+            "rest_pose": maker.rest_pose(name).tolist(),
+            "panel_center": maker.panel_center(name).tolist(),
+            "panel_scale": category.panel_scale,
+            "statistics": _statistics([meta["metrics"] for meta in metas]),
+            "rejections": [dict(garment=m["name"], reason=reason) for m in metas for reason in m["rejections"]],
+        }
+    index = {
+        "schema": _SCHEMA, "version": _VERSION, "body": recipe.body, "body_sha256": maker.body_sha256,
+        "seed": recipe.seed, "edge_length": recipe.edge_length, "categories": categories,
+    }  # fmt: skip
+    partial = out / "dataset.json.partial"
+    partial.write_text(json.dumps(index, indent=1) + "\n")
+    os.replace(partial, out / "dataset.json")
+
+
+def _statistics(metrics: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    return {
+        key: {"min": float(min(v)), "median": float(np.median(v)), "max": float(max(v))}
+        for key in metrics[0]
+        for v in [[m[key] for m in metrics]]
+    }

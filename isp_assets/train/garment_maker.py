@@ -1,0 +1,185 @@
+"""Makes one training garment: parameters, pattern, rest shape, checks, file."""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from isp_assets.body import Body
+from isp_assets.conventions import JOINT_NAMES, NUM_JOINTS, PANELS
+from isp_assets.errors import DatasetError, GeometryError
+from isp_assets.train.landmarks import RestBody
+from isp_assets.train.pattern import Pattern, PatternCategory, SewnPattern, outline_samples, sew
+from isp_assets.train.pattern_skirt import SKIRT
+from isp_assets.train.pattern_top import TOP
+from isp_assets.train.pattern_trousers import TROUSERS
+from isp_assets.train.rest_drape import DrapeSettings, RestShape, drape_to_rest
+
+CATEGORIES: dict[str, PatternCategory] = {c.name: c for c in (TOP, SKIRT, TROUSERS)}
+FILE_VERSION = 1
+
+_ATTEMPTS = 8
+_OUTLINE_SPACING = 0.004
+_LIMITS = {"body_intersects": 0.5, "self_intersects": 0.5, "strain_max": 0.5, "residual": 2.0, "speed": 0.05}
+_REACH = 0.95  # of the network's coordinates
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What all garments of a data set share; plain values, so that it travels to worker processes."""
+
+    out: str
+    seed: int
+    body: str
+    edge_length: float
+
+
+class GarmentMaker:
+    """Makes the garments of a recipe, each from its category and index alone."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self._rest: dict[float, RestBody] = {}
+
+    @cached_property
+    def _body(self) -> Body:
+        return Body.load(self.recipe.body)
+
+    @property
+    def body_sha256(self) -> str:
+        """Digest of the body's content."""
+        return self._body.sha256
+
+    def rest_pose(self, category: str) -> Float[np.ndarray, "24 3"]:
+        """Axis-angle rest pose of a category [rad]: T-pose, legs turned outwards for trousers."""
+        pose = np.zeros((NUM_JOINTS, 3))
+        pose[JOINT_NAMES.index("left_hip"), 2] = CATEGORIES[category].leg_angle
+        pose[JOINT_NAMES.index("right_hip"), 2] = -CATEGORIES[category].leg_angle
+        return pose
+
+    def rest_body(self, category: str) -> RestBody:
+        """The body in a category's rest pose."""
+        return self._rest_body(self.rest_pose(category))
+
+    def panel_center(self, category: str) -> Float[np.ndarray, " 2"]:
+        """Origin of the network's coordinates [m]."""
+        return np.array(CATEGORIES[category].panel_center(self.rest_body(category).landmarks))
+
+    def name(self, category: str, index: int) -> str:
+        """Name of a preset, or category and number."""
+        presets = list(CATEGORIES[category].presets)
+        return presets[index] if index < len(presets) else f"{category}_{index:04d}"
+
+    def path(self, category: str, index: int) -> Path:
+        """File of a garment."""
+        return Path(self.recipe.out) / category / f"{index:04d}_{self.name(category, index)}.npz"
+
+    def is_made(self, category: str, index: int) -> bool:
+        """Whether the garment's file is there and whole.
+
+        Raises:
+            DatasetError: If it was made from another recipe.
+        """
+        path = self.path(category, index)
+        try:
+            meta = self.read_meta(path)
+        except (OSError, ValueError, KeyError):
+            return False
+        expected = self._provenance()
+        if meta["version"] != FILE_VERSION or meta["provenance"] != expected:
+            raise DatasetError(f"{path} was made as {meta['provenance']}, version {meta['version']}; expected {expected}, version {FILE_VERSION}; choose another folder")
+        return True
+
+    @staticmethod
+    def read_meta(path: Path) -> dict:
+        """The JSON part of a garment's file; every array is read, so a damaged file raises."""
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str({key: file[key] for key in file.files}["meta"]))
+
+    def make(self, category: str, index: int) -> str:
+        """Make one garment and its file; rejected drafts are drawn again and counted.
+
+        Returns:
+            A line for the user.
+
+        Raises:
+            DatasetError: If no draft is good.
+        """
+        rejections: list[str] = []
+        for attempt in range(_ATTEMPTS):
+            parameters = self._parameters(category, index, attempt)
+            try:
+                pattern, sewn, rest = self._try(category, parameters, attempt)
+            except GeometryError as error:
+                rejections.append(str(error))
+                continue
+            fault = self._fault(category, sewn, rest)
+            if fault is None:
+                break
+            rejections.append(fault)
+        else:
+            raise DatasetError(f"garment {self.name(category, index)!r}: no good draft in {_ATTEMPTS}: {rejections}")
+        meta = {
+            "version": FILE_VERSION, "name": self.name(category, index), "category": category, "index": index,
+            "provenance": self._provenance(), "parameters": asdict(parameters), "metrics": rest.metrics,
+            "rejections": rejections,
+        }  # fmt: skip
+        _save(self.path(category, index), pattern, sewn, rest, meta)
+        note = f", {len(rejections)} rejected" if rejections else ""
+        return f"{category} {meta['name']}: {len(rest.vertices)} vertices, strain {rest.metrics['strain_mean']:.1%}{note}"
+
+    def _parameters(self, category: str, index: int, attempt: int):
+        spec = CATEGORIES[category]
+        if index < len(spec.presets):
+            return list(spec.presets.values())[index]
+        return spec.sample(np.random.default_rng([self.recipe.seed, list(CATEGORIES).index(category), index, attempt]))
+
+    def _try(self, category: str, parameters, attempt: int) -> tuple[Pattern, SewnPattern, RestShape]:
+        body = self.rest_body(category)
+        standing = self._rest_body(np.zeros((NUM_JOINTS, 3))).landmarks
+        pattern = CATEGORIES[category].draw(body, standing, parameters)
+        sewn = sew(pattern, self.recipe.edge_length)
+        # A preset cannot be drawn again: a repeated try differs by settling longer.
+        settings = DrapeSettings(substeps=1000 + 250 * attempt, iterations=250 + 100 * attempt)
+        return pattern, sewn, drape_to_rest(sewn, body, settings)
+
+    def _fault(self, category: str, sewn: SewnPattern, rest: RestShape) -> str | None:
+        for key, limit in _LIMITS.items():
+            if not rest.metrics[key] <= limit:
+                return f"{key} {rest.metrics[key]:.3g} > {limit:g}"
+        reach = np.abs((sewn.vertex_xy - self.panel_center(category)) / CATEGORIES[category].panel_scale).max()
+        return None if reach <= _REACH else f"pattern reaches {reach:.3f} > {_REACH} of the panel"
+
+    def _rest_body(self, pose: Float[np.ndarray, "24 3"]) -> RestBody:
+        key = float(pose[1, 2])
+        if key not in self._rest:
+            with torch.no_grad():
+                posed = self._body.pose(torch.as_tensor(pose[None], dtype=torch.float32))
+            vertices = posed.vertices[0].numpy().astype(np.float64)
+            self._rest[key] = RestBody(vertices=vertices, faces=self._body.faces.numpy().astype(np.int64))
+        return self._rest[key]
+
+    def _provenance(self) -> dict:
+        return {"seed": self.recipe.seed, "body_sha256": self.body_sha256, "edge_length": self.recipe.edge_length}
+
+
+def _save(path: Path, pattern: Pattern, sewn: SewnPattern, rest: RestShape, meta: dict) -> None:
+    arrays = {"rest_vertices": rest.vertices, "anchors": sewn.anchors, "meta": np.array(json.dumps(meta))}
+    for side in PANELS:
+        panel = sewn.panels[side]
+        outline = outline_samples(pattern.panels[side], _OUTLINE_SPACING)
+        fields = ("xy", "faces", "vertex_index", "outline_xy", "outline_label", "outline_loop")
+        for name, value in zip(fields, (panel.xy, panel.faces, panel.vertex_index, *outline), strict=True):
+            arrays[f"{side}_{name}"] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    with partial.open("wb") as file:
+        np.savez(file, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)

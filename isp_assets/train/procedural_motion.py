@@ -1,0 +1,364 @@
+"""Make the motions that ship with the package: formulas for the body, inverse kinematics for the legs.
+
+Y up, metres, floor at ``y = 0``, walking along +Z. The feet are planted: each
+footprint is fixed first, and the leg is bent to reach it, so nothing slides.
+
+Run: ``python -m isp_assets.train.procedural_motion --out DIR``.
+"""
+
+import argparse
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from isp_assets.body import Body
+from isp_assets.conventions import JOINT_NAMES
+from isp_assets.motion import Motion
+
+FPS = 30
+_HOLD = 3.0  # seconds that a motion on the spot lasts: there and back
+_LEGS = {"left": (1, 4, 7, 10), "right": (2, 5, 8, 11)}  # hip, knee, ankle, ball of the foot
+_STANCE = 0.62  # part of a step cycle that a foot stays on the floor
+_TOE_UP, _HEEL_UP = 0.30, -0.85  # pitch of the foot at touch-down and at toe-off [rad]
+_LEG_REACH = 0.9995  # a leg is never quite straight: there the knee's direction is undefined
+
+Pose = Float[np.ndarray, "24 3"]
+Matrix = Float[np.ndarray, "3 3"]
+Point = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What placing feet needs to know of a body at rest."""
+
+    joints: Float[np.ndarray, "24 3"]
+    floor: float
+    """Height of the soles in rest space [m]."""
+    heels: dict[str, Float[np.ndarray, "3"]]
+    """The point of each heel that touches down first [m]."""
+
+    @classmethod
+    def of(cls, body: Body) -> "Figure":
+        vertices = body.template.double().numpy()
+        joints = (body.joint_regressor @ body.template).double().numpy()
+        floor = float(vertices[:, 1].min())
+        heels = {}
+        for side, (_, _, ankle, _) in _LEGS.items():
+            sole = (vertices[:, 1] < floor + 0.02) & (np.sign(vertices[:, 0]) == _sign(side))
+            # 15 mm ahead of the rearmost point: the heel is round.
+            heels[side] = np.array([joints[ankle, 0], floor, vertices[sole, 2].min() + 0.015])
+        return cls(joints, floor, heels)
+
+    @property
+    def standing(self) -> Float[np.ndarray, "3"]:
+        """Position of the pelvis joint when the soles rest on the floor [m]."""
+        return self.joints[0] - [0.0, self.floor, 0.0]
+
+
+@dataclass(frozen=True)
+class Gait:
+    """How a figure walks."""
+
+    seconds: float = 4.0
+    speed: float = 1.05
+    """[m/s]"""
+    cadence: float = 0.92
+    """Cycles of two steps per second."""
+    turn: float = 0.0
+    """Change of heading [rad/s]."""
+    width: float = 0.09
+    """Distance of each footprint from the path [m]."""
+
+    def path(self, time: float) -> tuple[Point, float]:
+        """Point on the floor and heading at a time: a line, or an arc of a circle."""
+        if self.turn == 0:
+            return np.array([0.0, 0.0, self.speed * time]), 0.0
+        radius, heading = self.speed / self.turn, self.turn * time
+        return np.array([radius * (1 - np.cos(heading)), 0.0, radius * np.sin(heading)]), heading
+
+    def footprint(self, side: str, step: float) -> tuple[Point, float]:
+        """Where a foot stands in its ``step``-th stance: beside the body at the middle of that stance."""
+        middle = (step + _STANCE / 2 - _phase_lag(side)) / self.cadence
+        centre, heading = self.path(middle)
+        return centre + _turn("y", heading) @ [_sign(side) * self.width, 0.0, 0.0], heading
+
+
+@dataclass(frozen=True)
+class FootPlacement:
+    """A foot at one instant: its print, and how it is rolled over heel or ball."""
+
+    position: Point
+    heading: float
+    pitch: float
+    """Toe up is positive [rad]."""
+    lift: float
+    toe_bend: float
+
+
+def walk(figure: Figure, gait: Gait) -> Motion:
+    """Walk along the gait's path, arms swinging against the legs."""
+    count = round(gait.seconds * FPS)
+    poses, positions = np.zeros((count, 24, 3)), np.zeros((count, 3))
+    for frame in range(count):
+        phase = frame / FPS * gait.cadence
+        centre, heading = gait.path(frame / FPS)
+        bob = -0.050 + 0.020 * np.cos(4 * np.pi * (phase - 0.31))
+        sway = np.cos(2 * np.pi * (phase - 0.31))
+        twist = np.cos(2 * np.pi * (phase - 0.03))
+        facing = _turn("y", heading)
+        pelvis = centre + facing @ [0.018 * sway, figure.standing[1] + bob, 0.0]
+        root = facing @ _turn("y", -0.10 * twist) @ _turn("z", -0.035 * sway) @ _turn("x", 0.03)
+        pose = poses[frame]
+        for side in _LEGS:
+            foot = _foot_at(gait, side, phase + _phase_lag(side))
+            ankle, rotation = _ankle_of(figure, side, foot)
+            _bend_leg(figure, side, pose, (pelvis, root), (ankle, rotation))
+            pose[_LEGS[side][3], 0] = foot.toe_bend
+        swing = 0.42 * np.cos(2 * np.pi * (phase - 0.05))
+        _lower_arms(pose, left=-swing, right=swing)
+        for joint in ("spine1", "spine2", "spine3"):
+            pose[_joint(joint), 1] = 0.06 * twist
+        pose[_joint("head"), 1] = -0.05 * twist
+        pose[0], positions[frame] = _vector(root), pelvis - figure.joints[0]
+    return Motion(poses, positions, fps=FPS)
+
+
+def arm_raise(figure: Figure) -> Motion:
+    """Lift both arms sideways overhead, and lower them."""
+    top = np.zeros((24, 3))
+    _set_pair(top, "shoulder", (0.0, 0.0, np.radians(58)))
+    _set_pair(top, "collar", (0.0, 0.0, np.radians(22)))
+    base = np.zeros((24, 3))
+    _lower_arms(base)
+    rest = np.zeros((24, 3))
+
+    def upper(pose: Pose, amount: float) -> None:
+        # Through the T-pose: from hanging to overhead the shortest arc would pass in front of the body.
+        first, second = min(2 * amount, 1.0), max(2 * amount - 1, 0.0)
+        pose[:] = _blend(base, rest, first) if second == 0 else _blend(rest, top, second)
+
+    return _on_the_spot(figure, upper, sink=0.004)
+
+
+def arms_crossed(figure: Figure) -> Motion:
+    """Cross the arms in front of the chest, and let them hang again."""
+    crossed = np.zeros((24, 3))
+    # Found by minimising the distance of wrists and elbows to points in front of the chest.
+    for joint, degrees in {
+        "left_collar": (2, -7, -6), "right_collar": (1, 3, 2),
+        "left_shoulder": (17, -75, -55), "right_shoulder": (27, 80, 63.5),
+        "left_elbow": (-1, -73, -2), "right_elbow": (-1, 75, 1),
+        "left_wrist": (-4, -19.5, -14), "right_wrist": (-3, 14, 12),
+    }.items():  # fmt: skip
+        crossed[_joint(joint)] = np.radians(degrees)
+    base = np.zeros((24, 3))
+    _lower_arms(base)
+
+    def upper(pose: Pose, amount: float) -> None:
+        pose[:] = _blend(base, crossed, _ease(1.4 * amount))
+
+    return _on_the_spot(figure, upper, sink=0.004)
+
+
+def squat(figure: Figure, depth: float = 0.48) -> Motion:
+    """Sink by ``depth`` metres with the arms stretched forward, and rise again."""
+
+    def upper(pose: Pose, amount: float) -> None:
+        _lower_arms(pose, left=1.35 * amount, right=1.35 * amount, bend=0.25 * (1 - amount))
+        pose[_joint("spine1"), 0] = pose[_joint("spine2"), 0] = 0.15 * amount
+        pose[_joint("head"), 0] = -0.45 * amount
+
+    return _on_the_spot(figure, upper, sink=0.005, depth=depth, stance=(0.08, 0.3))
+
+
+def _on_the_spot(
+    figure: Figure,
+    upper: Callable[[Pose, float], None],
+    *,
+    sink: float,
+    depth: float = 0.0,
+    stance: tuple[float, float] = (0.0, 0.0),
+) -> Motion:
+    """There and back with planted feet.
+
+    Args:
+        upper: Sets the joints above the pelvis for an amount from 0 to 1 and back to 0.
+        sink: How far the pelvis is held below full height, so that the knees can bend [m].
+        depth: How far the pelvis goes down and, by a third of it, back [m].
+        stance: How far each foot is set outward [m] and turned outward [rad].
+    """
+    count = round(_HOLD * FPS)
+    poses, positions = np.zeros((count, 24, 3)), np.zeros((count, 3))
+    for frame in range(count):
+        amount = float(_ease(1 - abs(2 * frame / (count - 1) - 1)))
+        pose = poses[frame]
+        upper(pose, amount)
+        pelvis = figure.standing + [0.0, -depth * amount - sink, -depth / 3 * amount]
+        root = _turn("x", 1.15 * depth * amount)
+        for side, (_, _, ankle, _) in _LEGS.items():
+            outward = _sign(side) * np.array(stance)
+            target = figure.joints[ankle] - [0.0, figure.floor, 0.0] + [outward[0], 0.0, 0.0]
+            _bend_leg(figure, side, pose, (pelvis, root), (target, _turn("y", outward[1])))
+        pose[0], positions[frame] = _vector(root), pelvis - figure.joints[0]
+    return Motion(poses, positions, fps=FPS)
+
+
+def _foot_at(gait: Gait, side: str, cycle: float) -> FootPlacement:
+    """The foot after ``cycle`` step cycles: flat, rolling, or swinging to the next print."""
+    step, part = np.floor(cycle), cycle % 1
+    position, heading = gait.footprint(side, step)
+    if part < _STANCE:
+        rolling = float(_ease((part - 0.38) / (_STANCE - 0.38))) ** 1.2
+        pitch = _TOE_UP * (1 - _ease(part / 0.10)) + _HEEL_UP * rolling
+        return FootPlacement(position, heading, pitch, lift=0.0, toe_bend=min(pitch, 0.0))
+    swing = (part - _STANCE) / (1 - _STANCE)
+    following, following_heading = gait.footprint(side, step + 1)
+    along = _ease(swing)
+    pitch = _HEEL_UP * (1 - _ease(swing / 0.55)) + _TOE_UP * _ease((swing - 0.45) / 0.55)
+    return FootPlacement(
+        position + along * (following - position),
+        heading + along * (following_heading - heading),
+        pitch,
+        lift=0.05 * np.sin(np.pi * swing),
+        toe_bend=min(pitch, 0.0) * (1 - _ease(swing / 0.4)),
+    )
+
+
+def _ankle_of(figure: Figure, side: str, foot: FootPlacement) -> tuple[Point, Matrix]:
+    """Ankle position and foot rotation: the foot turns about its heel (toe up) or its ball (heel up)."""
+    _, _, ankle, ball_joint = _LEGS[side]
+    joints = figure.joints
+    rotation = _turn("y", foot.heading) @ _turn("x", -foot.pitch)
+    ball = np.array([joints[ball_joint, 0], figure.floor, joints[ball_joint, 2]])
+    pivot = figure.heels[side] if foot.pitch > 0 else ball
+    # The print lies 3 cm in front of the ankle; ball and heel follow from it, flat on the floor.
+    ball_ahead = np.array([0.0, 0.0, joints[ball_joint, 2] - joints[ankle, 2] - 0.03])
+    world_pivot = (
+        foot.position + _turn("y", foot.heading) @ (ball_ahead + pivot - ball) + [0.0, foot.lift, 0.0]
+    )
+    return world_pivot + rotation @ (joints[ankle] - pivot), rotation
+
+
+def _bend_leg(
+    figure: Figure, side: str, pose: Pose, pelvis: tuple[Point, Matrix], ankle: tuple[Point, Matrix]
+) -> None:
+    """Set hip, knee and ankle so that the ankle joint and the foot are where they should be.
+
+    The knee turns about x alone, by the angle that gives the leg the right length
+    ``|thigh + R_x shin|``; the hip then points the leg at the target by the smallest rotation.
+    """
+    hip, knee, heel, _ = _LEGS[side]
+    joints = figure.joints
+    position, root = pelvis
+    target, foot = ankle
+    thigh, shin = joints[knee] - joints[hip], joints[heel] - joints[knee]
+    reach = target - (position + root @ (joints[hip] - joints[0]))
+    longest = np.hypot(np.linalg.norm(thigh[1:]) + np.linalg.norm(shin[1:]), thigh[0] + shin[0])
+    length = min(float(np.linalg.norm(reach)), _LEG_REACH * longest)
+    # |thigh + R_x(t) shin|² = length² is cosine cos(t) + sine sin(t) + rest = 0.
+    cosine = 2 * (thigh[1] * shin[1] + thigh[2] * shin[2])
+    sine = 2 * (thigh[2] * shin[1] - thigh[1] * shin[2])
+    rest = thigh @ thigh + shin @ shin + 2 * thigh[0] * shin[0] - length**2
+    middle, spread = np.arctan2(sine, cosine), np.arccos(np.clip(-rest / np.hypot(cosine, sine), -1, 1))
+    bend = middle + spread  # of the two solutions the one in which the knee points forward
+    hip_world = _shortest_turn(root @ (thigh + _turn("x", bend) @ shin), reach) @ root
+    pose[hip] = _vector(root.T @ hip_world)
+    pose[knee] = [bend, 0.0, 0.0]
+    pose[heel] = _vector((hip_world @ _turn("x", bend)).T @ foot)
+
+
+def _lower_arms(pose: Pose, *, left: float = 0.0, right: float = 0.0, bend: float = 0.25) -> None:
+    """Let the arms hang, swung forward by an angle each; the elbow bends more when forward [rad]."""
+    for side, swing in (("left", left), ("right", right)):
+        sign = _sign(side)
+        pose[_joint(f"{side}_collar")] = [0.0, 0.0, -sign * np.radians(8)]
+        pose[_joint(f"{side}_shoulder")] = _vector(_turn("x", -swing) @ _turn("z", -sign * np.radians(66)))
+        pose[_joint(f"{side}_elbow")] = [0.0, -sign * (bend + 0.5 * max(swing, 0.0)), 0.0]
+
+
+def _set_pair(pose: Pose, joint: str, left: tuple[float, float, float]) -> None:
+    """Set a left joint and its mirror image."""
+    pose[_joint(f"left_{joint}")] = left
+    pose[_joint(f"right_{joint}")] = np.array(left) * [1, -1, -1]
+
+
+def _blend(start: Pose, end: Pose, amount: float) -> Pose:
+    """Every joint turned from ``start`` towards ``end`` along the shortest arc."""
+    first, last = Rotation.from_rotvec(start), Rotation.from_rotvec(end)
+    return (first * Rotation.from_rotvec(amount * (first.inv() * last).as_rotvec())).as_rotvec()
+
+
+def _ease(value: float) -> float:
+    """0 below 0, 1 above 1, and a smooth step between."""
+    clipped = min(max(value, 0.0), 1.0)
+    return clipped * clipped * (3 - 2 * clipped)
+
+
+def _shortest_turn(start: Point, end: Point) -> Matrix:
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, start @ end)).as_matrix()
+
+
+def _turn(axis: str, angle: float) -> Matrix:
+    return Rotation.from_euler(axis, angle).as_matrix()
+
+
+def _vector(matrix: Matrix) -> Point:
+    return Rotation.from_matrix(matrix).as_rotvec()
+
+
+def _joint(name: str) -> int:
+    return JOINT_NAMES.index(name)
+
+
+def _sign(side: str) -> int:
+    return 1 if side == "left" else -1
+
+
+def _phase_lag(side: str) -> float:
+    """The right foot steps half a cycle after the left."""
+    return 0.0 if side == "left" else 0.5
+
+
+def shipped_motions(body: Body) -> dict[str, Motion]:
+    """All motions of the package, by name."""
+    figure = Figure.of(body)
+    return {
+        "walk": walk(figure, Gait()),
+        "turn": walk(figure, Gait(turn=0.9, speed=0.9, cadence=0.85)),
+        "arm_raise": arm_raise(figure),
+        "squat": squat(figure),
+        "arms_crossed": arms_crossed(figure),
+    }
+
+
+def _write(motion: Motion, path: Path) -> None:
+    poses = motion.poses.reshape(len(motion), 72).astype(np.float32)
+    translation = motion.translation.astype(np.float32)
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+        np.savez_compressed(file, poses=poses, trans=translation, mocap_framerate=motion.fps, up="y")
+    os.replace(file.name, path)
+
+
+def main() -> None:
+    """Write every shipped motion as an ``.npz`` with AMASS's keys."""
+    parser = argparse.ArgumentParser(description="Make the motions that ship with the package.")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write the .npz files to")
+    folder = parser.parse_args().out
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, motion in shipped_motions(Body.load()).items():
+        _write(motion, folder / f"{name}.npz")
+        print(f"{name}: {len(motion)} frames at {motion.fps} fps")
+
+
+if __name__ == "__main__":
+    main()
