@@ -6,7 +6,6 @@ then a rename) and deterministic: the same content gives the same bytes.
 
 import json
 import os
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import torch
 from safetensors.torch import save as to_bytes
 
 from isp_assets.errors import BundleError
+from isp_assets.files import published
 
 Manifest = dict[str, Any]
 Tensors = dict[str, torch.Tensor]
@@ -47,7 +47,8 @@ def save_tensors(
     except (TypeError, ValueError) as error:
         raise BundleError(f"{path}: the manifest holds a value that JSON cannot keep: {error}") from error
     plain = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
-    write_atomic(path, to_bytes(plain, metadata={_KEY: text}))
+    with published(Path(path)) as temporary:
+        temporary.write_bytes(to_bytes(plain, metadata={_KEY: text}))
 
 
 def load_tensors(
@@ -98,20 +99,3 @@ def _check_kind(path: Path, manifest: Any, schema: str, version: int) -> None:
             f"{path}: version {manifest['version']} of {schema!r} is not known; this release reads 1..{version}; "
             "upgrade isp-assets"
         )
-
-
-def write_atomic(path: str | os.PathLike, content: bytes) -> None:
-    """Write a whole file or nothing: to a temporary name beside it, then renamed."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
