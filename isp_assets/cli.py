@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from isp_assets.cli_train import dataset_app, train_app
 from isp_assets.conventions import FrameRange
 from isp_assets.errors import IspAssetsError
 
@@ -27,6 +28,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Drape ordered stacks of implicit-sewing-pattern garments over SMPL motion.",
 )
+app.add_typer(dataset_app, name="dataset")
+app.add_typer(train_app, name="train")
 out_console = Console()
 error_console = Console(stderr=True, soft_wrap=True)
 
@@ -180,9 +183,6 @@ def main() -> None:
     except IspAssetsError as error:
         error_console.print(f"[bold red]error:[/] {_plain(str(error))}", highlight=False)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        error_console.print("interrupted; nothing half-written was left")
-        sys.exit(130)
 
 
 def _plain(text: str) -> str:

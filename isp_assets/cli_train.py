@@ -1,0 +1,80 @@
+"""The command line's making side: training data, networks, bundles. One function a verb; no logic."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from isp_assets.train.loop import RunOptions
+
+dataset_app = typer.Typer(no_args_is_help=True, help="Make training garments.")
+train_app = typer.Typer(no_args_is_help=True, help="Train the networks of a bundle.")
+
+OutOption = Annotated[Path, typer.Option("--out", help="Output folder; made if missing.")]
+DataOption = Annotated[Path, typer.Option("--data", help="Dataset folder, as `dataset make` writes it.")]
+CategoryOption = Annotated[str, typer.Option("--category", help="top, skirt or trousers.")]
+MinutesOption = Annotated[float | None, typer.Option("--minutes", help="Training time; or give --steps.")]
+StepsOption = Annotated[int | None, typer.Option("--steps", help="Number of steps; or give --minutes.")]
+SeedOption = Annotated[int, typer.Option("--seed")]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")]
+DeviceOption = Annotated[str, typer.Option("--device", help="cpu or cuda.")]
+
+
+@dataset_app.command("make")
+def make(
+    out: OutOption,
+    tops: Annotated[int, typer.Option(help="Shirts and jackets; the first nine are named.")] = 60,
+    skirts: Annotated[int, typer.Option(help="Skirts; the first five are named.")] = 60,
+    trousers: Annotated[int, typer.Option(help="Trousers; the first five are named.")] = 60,
+    seed: SeedOption = 0,
+    body: Annotated[str, typer.Option(help='"default" or an SMPL .npz or .pkl file.')] = "default",
+    workers: Annotated[int, typer.Option(help="Processes, one thread each.")] = 2,
+    edge_length: Annotated[float, typer.Option(help="Triangle side [m].")] = 0.018,
+) -> None:
+    """Draw two-panel patterns, drape them on the rest body, and store them. Run again to resume."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from isp_assets.train.dataset import make_dataset
+
+    counts = {"top": tops, "skirt": skirts, "trousers": trousers}
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns) as bar:
+        task = bar.add_task("starting", total=None)
+        make_dataset(
+            out,
+            counts={category: count for category, count in counts.items() if count},
+            seed=seed,
+            body=body,
+            workers=workers,
+            edge_length=edge_length,
+            progress=lambda done, total, text: bar.update(
+                task, completed=done, total=total, description=text
+            ),
+        )
+
+
+@train_app.command("patterns")
+def patterns(
+    data: DataOption,
+    category: CategoryOption,
+    out: OutOption,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    resume: ResumeOption = False,
+    device: DeviceOption = "cpu",
+    width: Annotated[int, typer.Option(help="Width of the panel fields.")] = 128,
+) -> None:
+    """Train the panel fields of a category and a latent code for each garment (Eqs. 1-2)."""
+    from isp_assets.train.dataset import load_dataset
+    from isp_assets.train.patterns import PatternOptions, train_patterns
+
+    run = _run(minutes, steps, seed, resume, device)
+    train_patterns(load_dataset(data, category), out, run=run, options=PatternOptions(width=width))
+
+
+def _run(minutes: float | None, steps: int | None, seed: int, resume: bool, device: str) -> "RunOptions":
+    from isp_assets.train.loop import RunOptions
+
+    return RunOptions(steps=steps, minutes=minutes, seed=seed, resume=resume, device=device)
