@@ -36,8 +36,11 @@ class Hinges:
 def edges(faces: Int[np.ndarray, "F 3"]) -> Edges:
     """Collect the undirected edges of a mesh."""
     directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    unique, inverse = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    directed = np.sort(directed, axis=1).astype(np.int64)
+    # One number an edge, in the order of its rows: sorting numbers is far faster than sorting rows.
+    keys, inverse = np.unique((directed[:, 0] << 32) | directed[:, 1], return_inverse=True)
     inverse = inverse.reshape(-1)
+    unique = np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1)
     count = np.bincount(inverse, minlength=len(unique))
     return Edges(vertices=unique, face_edge=inverse.reshape(-1, 3), num_faces=count)
 

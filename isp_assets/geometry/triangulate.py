@@ -14,6 +14,9 @@ from isp_assets.errors import GeometryError
 
 _CLEARANCE = 0.62
 """Distance of lattice points from the outline, in spacings; nearer points make thin triangles."""
+_DEEP = 1.2
+"""Lattice points so far from the outline, in spacings, are Delaunay neighbours of lattice points only:
+a circumcircle there has radius 0.58 and cannot reach an outline point."""
 
 
 def triangulate_panel(
@@ -51,45 +54,92 @@ def triangulate_panel(
 
 def points_in_polygon(points: Float[np.ndarray, "n 2"], loop: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " n"]:
     """Tell which points lie inside a closed polygon, by the even-odd rule."""
-    inside = np.zeros(len(points), dtype=bool)
-    x, y = points[:, 0], points[:, 1]
-    for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
-        if a[1] == b[1]:
-            continue
-        spans = (a[1] > y) != (b[1] > y)
-        inside ^= spans & (x < a[0] + (y - a[1]) / (b[1] - a[1]) * (b[0] - a[0]))
-    return inside
+    return _enclosed(points, loop, np.roll(loop, -1, axis=0))
+
+
+def _enclosed(
+    points: Float[np.ndarray, "n 2"], start: Float[np.ndarray, "m 2"], end: Float[np.ndarray, "m 2"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether a ray from each point towards +x crosses an odd number of segments.
+
+    Points are sorted by height, so every segment meets only the few in its span.
+    """
+    order = np.argsort(points[:, 1], kind="stable")
+    height = points[order, 1]
+    low, high = (f(start[:, 1], end[:, 1]) for f in (np.minimum, np.maximum))
+    first, last = np.searchsorted(height, low), np.searchsorted(height, high)
+    count = last - first
+    segment = np.repeat(np.arange(len(start)), count)
+    at = order[np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)]
+    a, along = start[segment], (end - start)[segment]
+    crossing = a[:, 0] + (points[at, 1] - a[:, 1]) / along[:, 1] * along[:, 0]
+    return np.bincount(at[points[at, 0] < crossing], minlength=len(points)) % 2 == 1
 
 
 def _fill(loop: Float[np.ndarray, "n 2"], spacing: float, *, where: str):
-    """Lattice points and faces of one loop; faces index the loop, then the lattice."""
+    """Lattice points and faces of one loop; faces index the loop, then the lattice.
+
+    Deep inside, the lattice's own triangles are the Delaunay triangulation already;
+    only the strip between them and the outline is left to compute.
+    """
     if loop.ndim != 2 or loop.shape[1] != 2 or len(loop) < 3 or not np.isfinite(loop).all():
         raise GeometryError(f"{where}: expected at least 3 finite points of shape [n, 2], got shape {loop.shape}")
-    lattice = _lattice_inside(loop, spacing)
+    lattice, regular, buried = _lattice_inside(loop, spacing)
     points = np.concatenate([loop, lattice])
-    triangles = Delaunay(points).simplices.astype(np.int64)
-    triangles = _counter_clockwise(points, triangles)
-    missing = _missing_edges(triangles, len(loop))
-    for a, b in missing:
-        _recover_edge(points, triangles, a, b, where=where)
-    triangles = triangles[points_in_polygon(points[triangles].mean(axis=1), loop)]
+    regular = regular + len(loop)
+    strip = np.concatenate([np.arange(len(loop)), len(loop) + np.flatnonzero(~buried)])
+    triangles = Delaunay(points[strip]).simplices.astype(np.int64)
+    triangles = _counter_clockwise(points[strip], triangles)
+    for a, b in _missing_edges(triangles, len(loop)):
+        _recover_edge(points[strip], triangles, a, b, where=where)
+    triangles = strip[triangles]
+    directed = np.stack([regular, np.roll(regular, -1, 1)], -1).reshape(-1, 2)
+    rim = directed[~np.isin(_edge_keys(directed), _edge_keys(directed[:, ::-1]))]
+    start = points[np.concatenate([np.arange(len(loop)), rim[:, 0]])]
+    end = points[np.concatenate([np.roll(np.arange(len(loop)), -1), rim[:, 1]])]
+    triangles = triangles[_enclosed(points[triangles].mean(axis=1), start, end)]
     triangles = triangles[_double_area(points, triangles) > 1e-6 * spacing**2]
+    triangles = np.concatenate([triangles, regular])
     _check_filled(points, triangles, loop, where=where)
     return lattice, triangles
 
 
-def _lattice_inside(loop: Float[np.ndarray, "n 2"], spacing: float) -> Float[np.ndarray, "m 2"]:
+def _lattice_inside(loop: Float[np.ndarray, "n 2"], spacing: float):
+    """Lattice points inside a loop, the triangles among those far from it, and which points have no others."""
     low, high = loop.min(axis=0), loop.max(axis=0)
     row_height = spacing * np.sqrt(3) / 2
-    rows = np.arange(np.floor(low[1] / row_height), np.ceil(high[1] / row_height) + 1)
+    rows = np.arange(np.floor(low[1] / row_height) - 1, np.ceil(high[1] / row_height) + 2)
     columns = np.arange(np.floor(low[0] / spacing) - 1, np.ceil(high[0] / spacing) + 2)
     column, row = np.meshgrid(columns, rows)
     lattice = np.stack([(column + 0.5 * (np.abs(row) % 2)) * spacing, row * row_height], axis=-1).reshape(-1, 2)
-    lattice = lattice[points_in_polygon(lattice, loop)]
+    inside = np.flatnonzero(points_in_polygon(lattice, loop))
     step = np.linspace(0, 1, 6)[:-1, None, None]
     dense = (loop + step * (np.roll(loop, -1, axis=0) - loop)).reshape(-1, 2)
-    distance, _ = cKDTree(dense).query(lattice)
-    return lattice[distance > _CLEARANCE * spacing]
+    distance = np.zeros(len(lattice))
+    distance[inside], _ = cKDTree(dense).query(lattice[inside])
+    kept = np.flatnonzero(distance > _CLEARANCE * spacing)
+    deep = (distance > _DEEP * spacing).reshape(row.shape)
+    triangles, used = _lattice_triangles(deep, np.abs(rows) % 2 == 1)
+    number = np.full(len(lattice), -1)
+    number[kept] = np.arange(len(kept))
+    return lattice[kept], number[triangles], used.reshape(-1)[kept] == 6
+
+
+def _lattice_triangles(deep: Bool[np.ndarray, "r c"], shifted: Bool[np.ndarray, " r"]):
+    """Upward and downward triangles whose corners are all deep, and how many meet at each lattice point."""
+    index = np.arange(deep.size).reshape(deep.shape)
+    odd = shifted[:-1, None]
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    up = np.where(odd[..., None], np.stack([a, b, d], -1), np.stack([a, b, c], -1))
+    down = np.where(odd[..., None], np.stack([a, d, c], -1), np.stack([b, d, c], -1))
+    triangles = np.concatenate([up.reshape(-1, 3), down.reshape(-1, 3)])
+    triangles = triangles[deep.reshape(-1)[triangles].all(axis=1)]
+    return triangles, np.bincount(triangles.reshape(-1), minlength=deep.size)
+
+
+def _edge_keys(directed: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """One number an edge: sorting numbers is far faster than sorting rows."""
+    return (directed[:, 0] << 32) | directed[:, 1]
 
 
 def _double_area(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " F"]:
@@ -103,8 +153,10 @@ def _counter_clockwise(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, 
 
 
 def _missing_edges(faces: Int[np.ndarray, "F 3"], n: int) -> list[tuple[int, int]]:
-    present = {tuple(e) for e in np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1).tolist()}
-    return [(i, (i + 1) % n) for i in range(n) if tuple(sorted((i, (i + 1) % n))) not in present]
+    directed = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), axis=1)
+    loop = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
+    missing = ~np.isin(_edge_keys(np.sort(loop, axis=1)), _edge_keys(directed))
+    return [(int(a), int(b)) for a, b in loop[missing]]
 
 
 def _crosses(p, q, a, b) -> bool:
@@ -147,11 +199,10 @@ def _recover_edge(points, faces, a: int, b: int, *, where: str) -> None:
 def _check_filled(points, faces, loop, *, where: str) -> None:
     """The border of the faces must be exactly the loop, and their area the polygon's."""
     n = len(loop)
-    directed = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
-    unique, inverse = np.unique(np.sort(directed, 1), axis=0, return_inverse=True)
-    border = unique[np.bincount(inverse.reshape(-1)) == 1]
-    expected = np.sort(np.stack([np.arange(n), (np.arange(n) + 1) % n], 1), 1)
-    expected = expected[np.lexsort((expected[:, 1], expected[:, 0]))]
+    directed = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), axis=1)
+    keys, count = np.unique(_edge_keys(directed), return_counts=True)
+    border = keys[count == 1]
+    expected = np.sort(_edge_keys(np.sort(np.stack([np.arange(n), (np.arange(n) + 1) % n], 1), axis=1)))
     if not np.array_equal(border, expected):
         raise GeometryError(
             f"{where}: the outline is not kept by its triangulation ({len(border)} border edges, expected {n}); "
@@ -160,5 +211,5 @@ def _check_filled(points, faces, loop, *, where: str) -> None:
     following = np.roll(loop, -1, axis=0)
     area = abs((loop[:, 0] * following[:, 1] - loop[:, 1] * following[:, 0]).sum())
     filled = _double_area(points, faces).sum()
-    if abs(filled - area) > 1e-6 * area or len(np.unique(faces)) != len(points):
+    if abs(filled - area) > 1e-6 * area or (np.bincount(faces.reshape(-1), minlength=len(points)) == 0).any():
         raise GeometryError(f"{where}: triangles cover {filled / 2:.6g} m^2 of {area / 2:.6g} m^2; does the outline cross itself?")
