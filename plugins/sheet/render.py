@@ -9,17 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from PIL import Image
 
 from isp_assets.errors import PluginError
 from isp_assets.frames import Layer
 
 from .camera import Camera, View
-from .shading import ambient_occlusion, linear_from_srgb, shade, srgb_from_linear, vertex_normals
-from .tracer import Tracer
+from .shading import SurfacePoints, ambient_occlusion, shade, vertex_normals
+from .texture import MipTexture, linear_from_srgb, srgb_from_linear
+from .tracer import Hits, Tracer
 
 SKIN = (0.66, 0.64, 0.63)
 """Display colour of the body: a neutral grey that leaves the colours to the clothes."""
+
+_GROUND_SHADOW = 0.38
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,98 +74,108 @@ def render_view(
         PluginError: If there is nothing to draw.
         MissingExtraError: If ``embreex`` is not installed.
     """
-    if not meshes:
-        raise PluginError("sheet: no meshes to draw")
-    view = View.place(camera or Camera(), np.concatenate([m.vertices for m in meshes]), size)
-    scene = _Scene(meshes, view, samples)
-    image = np.zeros((size[1], size[0], 3))
-    for step in range(samples**2):
-        image += scene.sample(step, samples, ground)
-    return (255.0 * srgb_from_linear(image / samples**2) + 0.5).astype(np.uint8)
+    return RenderScene(meshes).draw(camera or Camera(), size, samples=samples, ground=ground)
 
 
-class _Scene:
-    """The meshes as one soup of triangles, with everything shading looks up."""
+class RenderScene:
+    """Meshes made ready for pictures from any number of sides: one soup of triangles, its normals, its shade.
 
-    def __init__(self, meshes: Sequence[RenderMesh], view: View, samples: int) -> None:
+    Raises:
+        PluginError: If there is nothing to draw.
+        MissingExtraError: If ``embreex`` is not installed.
+    """
+
+    def __init__(self, meshes: Sequence[RenderMesh]) -> None:
+        if not meshes:
+            raise PluginError("sheet: no meshes to draw")
         starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
-        self.vertices = np.concatenate([m.vertices for m in meshes]).astype(np.float32)
+        self._meshes = meshes
+        self._vertices = np.concatenate([m.vertices for m in meshes]).astype(np.float32)
         faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-        self.faces = np.concatenate(faces).astype(np.int32)
-        self.mesh_of_face = np.repeat(np.arange(len(meshes)), [len(m.faces) for m in meshes])
-        self.first_face = np.cumsum([0] + [len(m.faces) for m in meshes])
-        self.meshes = meshes
-        self.view = view
-        self.tracer = Tracer(self.vertices, self.faces)
-        self.normals = vertex_normals(self.vertices, self.faces)
-        self.openness = ambient_occlusion(self.tracer, self.vertices, self.normals)
-        texel = view.metres_per_pixel / samples
-        self.textures = [None if m.texture is None else _shrunk(m, texel) for m in meshes]
+        self._faces = np.concatenate(faces).astype(np.int32)
+        self._mesh_of_face = np.repeat(np.arange(len(meshes)), [len(m.faces) for m in meshes])
+        self._first_face = np.cumsum([0] + [len(m.faces) for m in meshes])
+        self._tracer = Tracer(self._vertices, self._faces)
+        self._normals = vertex_normals(self._vertices, self._faces)
+        self._openness = ambient_occlusion(self._tracer, self._vertices, self._normals)
+        self._textures = [None if m.texture is None else MipTexture(m.texture) for m in meshes]
+        self._texel_sizes = [_texel_size(mesh) for mesh in meshes]
 
-    def sample(self, step: int, samples: int, ground: float | None) -> Float[np.ndarray, "H W 3"]:
+    def draw(
+        self, camera: Camera, size: tuple[int, int], *, samples: int = 3, ground: float | None = None
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """One picture; see `render_view`."""
+        view = View.place(camera, self._vertices, size)
+        image = np.zeros((size[1], size[0], 3))
+        for step in range(samples**2):
+            image += self._sample(view, step, samples, ground)
+        return (255.0 * srgb_from_linear(image / samples**2) + 0.5).astype(np.uint8)
+
+    def _sample(
+        self, view: View, step: int, samples: int, ground: float | None
+    ) -> Float[np.ndarray, "H W 3"]:
         """Linear light through one point of every pixel."""
-        jitter = ((step % samples + 0.5) / samples, (step // samples + 0.5) / samples)
-        rays = self.view.rays(jitter)
-        light = self.view.light(step, samples**2)
-        hit = self.tracer.first_hit(self.view.eye, rays)
-        image = self.view.backdrop()
+        rays = view.rays(((step % samples + 0.5) / samples, (step // samples + 0.5) / samples))
+        light = view.light(step, samples**2)
+        hit = self._tracer.first_hit(view.eye, rays)
+        image = view.backdrop()
         flat = image.reshape(-1, 3)
         toward = rays[hit.ray]
         toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-        flat[hit.ray] = self._shade(hit, toward, light)
+        flat[hit.ray] = self._shade(hit, toward, light, view.metres_per_pixel / samples)
         if ground is not None:
-            self._ground_shadow(flat, hit.missed, rays, light, ground)
+            self._ground_shadow(flat, hit.missed, rays, view, light, ground)
         return image
 
-    def _shade(self, hit, rays, light):
-        corners = self.faces[hit.face]
+    def _shade(
+        self, hit: Hits, rays: Float[np.ndarray, "n 3"], light: Float[np.ndarray, " 3"], footprint: float
+    ) -> Float[np.ndarray, "n 3"]:
+        corners = self._faces[hit.face]
         weights = hit.weights[..., None]
-        normal = (self.normals[corners] * weights).sum(1)
-        openness = (self.openness[corners] * hit.weights).sum(1)
-        point = (self.vertices[corners] * weights).sum(1)
-        return shade(self.tracer, point, normal, hit.facing(rays), openness, self._albedo(hit), rays, light)
+        surface = SurfacePoints(
+            point=(self._vertices[corners] * weights).sum(1),
+            normal=(self._normals[corners] * weights).sum(1),
+            outside=hit.facing(rays),
+            openness=(self._openness[corners] * hit.weights).sum(1),
+            albedo=self._albedo(hit, footprint),
+        )
+        return shade(self._tracer, surface, rays, light)
 
-    def _albedo(self, hit) -> Float[np.ndarray, "n 3"]:
-        albedo = np.empty((len(hit.face), 3))
-        which = self.mesh_of_face[hit.face]
-        for index, (mesh, texture) in enumerate(zip(self.meshes, self.textures, strict=True)):
-            chosen = which == index
+    def _albedo(self, hit: Hits, footprint: float) -> Float[np.ndarray, "n 3"]:
+        albedo = np.empty((len(hit.face), 3), np.float32)
+        which = self._mesh_of_face[hit.face]
+        for index, (mesh, texture) in enumerate(zip(self._meshes, self._textures, strict=True)):
+            chosen = np.flatnonzero(which == index)
             if texture is None or mesh.corner_st is None:
                 albedo[chosen] = linear_from_srgb(np.array(mesh.color))
                 continue
-            corner_st = mesh.corner_st[hit.face[chosen] - self.first_face[index]]
-            albedo[chosen] = _bilinear(texture, (corner_st * hit.weights[chosen][..., None]).sum(1))
+            corner_st = mesh.corner_st[hit.face[chosen] - self._first_face[index]]
+            st = (corner_st * hit.weights[chosen][..., None]).sum(1)
+            albedo[chosen] = texture.sample(st, footprint / self._texel_sizes[index])
         return albedo
 
-    def _ground_shadow(self, flat, missed, rays, light, ground: float) -> None:
+    def _ground_shadow(
+        self,
+        flat: Float[np.ndarray, "n 3"],
+        missed: Int[np.ndarray, " m"],
+        rays: Float[np.ndarray, "n 3"],
+        view: View,
+        light: Float[np.ndarray, " 3"],
+        ground: float,
+    ) -> None:
+        """Darken the floor, in place, where the lamp does not reach it."""
+        missed = missed[rays[missed, 1] < -1e-6]
         direction = rays[missed]
-        down = direction[:, 1] < -1e-6
-        missed, direction = missed[down], direction[down]
-        distance = (ground - self.view.eye[1]) / direction[:, 1]
-        point = self.view.eye + distance[:, None] * direction
-        near = np.abs(point - self.view.target)[:, [0, 2]].max(1) < 2.0
-        lit = ~self.tracer.blocked(point[near], np.broadcast_to(light, (int(near.sum()), 3)))
-        flat[missed[near]] *= np.where(lit, 1.0, 0.62)[:, None]
+        point = view.eye + ((ground - view.eye[1]) / direction[:, 1])[:, None] * direction
+        near = (np.abs(point[:, 0] - view.target[0]) < 2.0) & (np.abs(point[:, 2] - view.target[2]) < 2.0)
+        blocked = self._tracer.blocked(point[near], np.broadcast_to(light, (int(near.sum()), 3)))
+        flat[missed[near][blocked]] *= 1.0 - _GROUND_SHADOW
 
 
-def _shrunk(mesh: RenderMesh, texel: float) -> Float[np.ndarray, "h w 3"]:
-    """The texture in linear light, averaged down until a texel covers about one sample (no moire)."""
-    assert mesh.texture is not None
-    assert mesh.corner_st is not None
+def _texel_size(mesh: RenderMesh) -> float:
+    """Mean size of a texel on the mesh [m]."""
+    if mesh.texture is None or mesh.corner_st is None:
+        return 1.0
     edges = np.linalg.norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).sum()
-    scale = np.array(mesh.texture.shape[1::-1])
-    texels = np.linalg.norm(np.diff(mesh.corner_st, axis=1) * scale, axis=2).sum()
-    factor = max(1, round(float(texel * texels / max(edges, 1e-9))))
-    image = Image.fromarray(mesh.texture)
-    return linear_from_srgb(np.asarray(image.reduce(factor) if factor > 1 else image) / 255.0)
-
-
-def _bilinear(texture: Float[np.ndarray, "h w 3"], st: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    height, width = texture.shape[:2]
-    x = np.clip(st[:, 0] * width - 0.5, 0, width - 1)
-    y = np.clip((1 - st[:, 1]) * height - 0.5, 0, height - 1)
-    x0, y0 = x.astype(int), y.astype(int)
-    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    top = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
-    return top * (1 - fy) + (texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx) * fy
+    texels = np.linalg.norm(np.diff(mesh.corner_st, axis=1) * mesh.texture.shape[1::-1], axis=2).sum()
+    return float(edges / max(texels, 1e-9))

@@ -1,5 +1,7 @@
 """Simple light: sky from above, a soft key lamp, a little from the camera. Arrays hold linear light."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -8,16 +10,23 @@ from .tracer import Tracer
 _SKY, _BOUNCE, _KEY, _CAMERA = 0.52, 0.30, 0.95, 0.16
 _INSIDE = 0.55  # the inner side of cloth is drawn darker, so openings read as openings
 _AMBIENT_RAYS = 48
+_LIFT = 1e-3  # [m]
 
 
-def linear_from_srgb(value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of matt surfaces to be lit."""
 
-
-def srgb_from_linear(value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    value = np.clip(value, 0.0, 1.0)
-    curve = 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(value <= 0.0031308, value * 12.92, curve)
+    point: Float[np.ndarray, "n 3"]
+    """World space [m]."""
+    normal: Float[np.ndarray, "n 3"]
+    """Of the outer side; any length."""
+    outside: Bool[np.ndarray, " n"]
+    """Whether the outer side is seen."""
+    openness: Float[np.ndarray, " n"]
+    """Share of the sky that the outer side sees, 0..1."""
+    albedo: Float[np.ndarray, "n 3"]
+    """Linear."""
 
 
 def vertex_normals(
@@ -41,31 +50,29 @@ def ambient_occlusion(
     side = np.cross(normals, np.where(np.abs(normals[:, 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]))
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-20)
     frame = np.stack([side, np.cross(normals, side), normals], 1)
-    directions = np.einsum("rk,vkc->vrc", local, frame)
-    lifted = points + 1e-3 * normals
+    directions = local.astype(np.float32) @ frame.astype(np.float32)
+    lifted = points + _LIFT * normals
     blocked = tracer.blocked(np.repeat(lifted, _AMBIENT_RAYS, 0), directions.reshape(-1, 3))
     return 1.0 - blocked.reshape(len(points), -1).mean(1)
 
 
 def shade(
     tracer: Tracer,
-    point: Float[np.ndarray, "n 3"],
-    normal: Float[np.ndarray, "n 3"],
-    outside: Bool[np.ndarray, " n"],
-    openness: Float[np.ndarray, " n"],
-    albedo: Float[np.ndarray, "n 3"],
+    surface: SurfacePoints,
     rays: Float[np.ndarray, "n 3"],
     light: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Reflected light of matt surfaces seen along ``rays``, with the lamp in direction ``light``."""
-    normal = normal * np.where(outside, 1.0, -1.0)[:, None]
+    """Reflected light seen along unit ``rays``, with the lamp in direction ``light`` (unit)."""
+    outside = surface.outside
+    normal = surface.normal * np.where(outside, 1.0, -1.0)[:, None]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    openness = np.where(outside, openness, 0.5)
+    openness = np.where(outside, surface.openness, 0.5)
     toward_lamp = normal @ light
-    lit = np.zeros(len(point), bool)
+    lit = np.zeros(len(normal), bool)
     front = np.flatnonzero(toward_lamp > 0)
-    lit[front] = ~tracer.blocked(point[front] + 1e-3 * normal[front], np.broadcast_to(light, (len(front), 3)))
+    start = surface.point[front] + _LIFT * normal[front]
+    lit[front] = ~tracer.blocked(start, np.broadcast_to(light, (len(front), 3)))
     ambient = (_BOUNCE + (_SKY - _BOUNCE) * (0.5 + 0.5 * normal[:, 1])) * openness
     camera = _CAMERA * np.clip(-(normal * rays).sum(1), 0.0, 1.0) * (0.4 + 0.6 * openness)
     energy = ambient + camera + _KEY * np.clip(toward_lamp, 0.0, 1.0) * lit
-    return albedo * (energy * np.where(outside, 1.0, _INSIDE))[:, None]
+    return surface.albedo * (energy * np.where(outside, 1.0, _INSIDE))[:, None]

@@ -14,7 +14,7 @@ from isp_assets.frames import FrameChunk, Scene
 
 from .camera import Camera
 from .layout import compose_page
-from .render import RenderMesh, render_view
+from .render import RenderMesh, RenderScene
 
 
 @dataclass(frozen=True)
@@ -101,13 +101,11 @@ class SheetWriter:
 
 def _draw(scene: Scene, frames: list[_Frame], style: SheetStyle) -> Image.Image:
     ground = min(float(frame.points[:, 1].min()) for frame in frames)
-    pictures = [
-        [
-            render_view(_meshes(scene, f), camera=c, size=style.cell, samples=style.samples, ground=ground)
-            for f, c in zip(frames, row, strict=True)
-        ]
-        for row in _cameras(scene, frames, style)
-    ]
+    pictures: list[list[np.ndarray]] = [[] for _ in style.rows]
+    for frame, cameras in zip(frames, _cameras(scene, frames, style), strict=True):
+        dressed = RenderScene(_meshes(scene, frame))
+        for row, camera in zip(pictures, cameras, strict=True):
+            row.append(dressed.draw(camera, style.cell, samples=style.samples, ground=ground))
     title = f"{scene.name}    frames {scene.frames}    {scene.fps:g} fps"
     captions = [str(frame.number) for frame in frames]
     return compose_page(title, scene.layers, captions, [caption for caption, _ in style.rows], pictures)
@@ -129,7 +127,7 @@ def _heading(scene: Scene, frame: _Frame) -> float:
 
 
 def _cameras(scene: Scene, frames: list[_Frame], style: SheetStyle) -> list[list[Camera]]:
-    """A camera for every row and frame: centred on the wearer, at one height and scale."""
+    """A camera for every frame and row: centred on the wearer, at one height and scale."""
     bottom = min(float(frame.points[:, 1].min()) for frame in frames)
     top = max(float(frame.points[:, 1].max()) for frame in frames)
     height = 1.12 * (top - bottom)
@@ -140,6 +138,5 @@ def _cameras(scene: Scene, frames: list[_Frame], style: SheetStyle) -> list[list
         turns.append((_heading(scene, frame), (float(x), (bottom + top) / 2, float(z))))
         reach = float(np.linalg.norm((high - low)[[0, 2]]))
         height = max(height, 0.9 * reach * style.cell[1] / style.cell[0])
-    return [
-        [Camera(heading + yaw, 8.0, target, height) for heading, target in turns] for _, yaw in style.rows
-    ]
+    yaws = [yaw for _, yaw in style.rows]
+    return [[Camera(heading + yaw, 8.0, target, height) for yaw in yaws] for heading, target in turns]

@@ -14,7 +14,8 @@ from isp_assets.plugin_conformance import check_writer, write_shot
 from isp_assets.synthetic import synthetic_shot
 from isp_assets_plugins.sheet import Camera, RenderMesh, SheetStyle, SheetWriter, render_view
 from isp_assets_plugins.sheet.camera import View
-from isp_assets_plugins.sheet.shading import linear_from_srgb, srgb_from_linear, vertex_normals
+from isp_assets_plugins.sheet.shading import vertex_normals
+from isp_assets_plugins.sheet.texture import MipTexture, linear_from_srgb, srgb_from_linear
 from isp_assets_plugins.sheet.tracer import Tracer
 from isp_assets_plugins.sheet.writer import _Frame, _heading
 
@@ -136,6 +137,17 @@ def test_inner_side_is_darker_than_the_outer():
 def test_srgb_round_trip():
     values = np.linspace(0, 1, 101)
     np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(values)), values, atol=1e-6)
+
+
+def test_fine_checks_fade_to_their_mean():
+    checks = (np.indices((64, 64)).sum(0) % 2 * 200).astype(np.uint8)
+    texture = MipTexture(np.repeat(checks[..., None], 3, 2))
+    st = np.random.default_rng(0).uniform(0.1, 0.9, (50, 2))
+    np.testing.assert_allclose(texture.sample(st, 8.0), linear_from_srgb(np.array(100 / 255)), atol=2e-3)
+    column, row = np.random.default_rng(1).integers(0, 64, (2, 50))
+    centres = np.stack([column + 0.5, 63.5 - row], 1) / 64
+    exact = linear_from_srgb(checks[row, column] / 255)[:, None].repeat(3, 1)
+    np.testing.assert_allclose(texture.sample(centres, 1.0), exact, atol=1e-6)
 
 
 def test_vertex_normals_of_a_square():
