@@ -197,11 +197,11 @@ def test_a_steady_turn_is_resampled_exactly_through_the_half_turn():
     assert_same_rotations(motion.poses[:, 0], expected, 1e-7)
 
 
-@given(
-    st.integers(1, 200),
-    st.sampled_from([23.976, 24, 25, 29.97, 30, 60, 120]),
-    st.sampled_from([24, 30, 60, 1000]),
-)
+RATES = [23.976, 24.0, 25.0, 29.97, 30.0, 60.0, 120.0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 60), st.sampled_from(RATES), st.sampled_from(RATES))
 def test_resampled_motion_lasts_as_long(count, before, after):
     motion = Motion(np.zeros((count, 24, 3)), np.zeros((count, 3)), fps=before)
     resampled = motion.resample(after)

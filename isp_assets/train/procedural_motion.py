@@ -8,57 +8,33 @@ Run: ``python -m isp_assets.train.procedural_motion --out DIR``.
 
 import argparse
 import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from isp_assets.body import Body
 from isp_assets.conventions import JOINT_NAMES
 from isp_assets.motion import Motion
+from isp_assets.train.leg_ik import (
+    LEGS,
+    Figure,
+    FootPlacement,
+    Point,
+    Pose,
+    ankle_of,
+    bend_leg,
+    sign,
+    turn,
+    vector,
+)
 
 FPS = 30
 _HOLD = 3.0  # seconds that a motion on the spot lasts: there and back
-_LEGS = {"left": (1, 4, 7, 10), "right": (2, 5, 8, 11)}  # hip, knee, ankle, ball of the foot
 _STANCE = 0.62  # part of a step cycle that a foot stays on the floor
 _TOE_UP, _HEEL_UP = 0.30, -0.85  # pitch of the foot at touch-down and at toe-off [rad]
-_LEG_REACH = 0.9995  # a leg is never quite straight: there the knee's direction is undefined
-
-Pose = Float[np.ndarray, "24 3"]
-Matrix = Float[np.ndarray, "3 3"]
-Point = Float[np.ndarray, "3"]
-
-
-@dataclass(frozen=True)
-class Figure:
-    """What placing feet needs to know of a body at rest."""
-
-    joints: Float[np.ndarray, "24 3"]
-    floor: float
-    """Height of the soles in rest space [m]."""
-    heels: dict[str, Float[np.ndarray, "3"]]
-    """The point of each heel that touches down first [m]."""
-
-    @classmethod
-    def of(cls, body: Body) -> "Figure":
-        vertices = body.template.double().numpy()
-        joints = (body.joint_regressor @ body.template).double().numpy()
-        floor = float(vertices[:, 1].min())
-        heels = {}
-        for side, (_, _, ankle, _) in _LEGS.items():
-            sole = (vertices[:, 1] < floor + 0.02) & (np.sign(vertices[:, 0]) == _sign(side))
-            # 15 mm ahead of the rearmost point: the heel is round.
-            heels[side] = np.array([joints[ankle, 0], floor, vertices[sole, 2].min() + 0.015])
-        return cls(joints, floor, heels)
-
-    @property
-    def standing(self) -> Float[np.ndarray, "3"]:
-        """Position of the pelvis joint when the soles rest on the floor [m]."""
-        return self.joints[0] - [0.0, self.floor, 0.0]
 
 
 @dataclass(frozen=True)
@@ -86,19 +62,7 @@ class Gait:
         """Where a foot stands in its ``step``-th stance: beside the body at the middle of that stance."""
         middle = (step + _STANCE / 2 - _phase_lag(side)) / self.cadence
         centre, heading = self.path(middle)
-        return centre + _turn("y", heading) @ [_sign(side) * self.width, 0.0, 0.0], heading
-
-
-@dataclass(frozen=True)
-class FootPlacement:
-    """A foot at one instant: its print, and how it is rolled over heel or ball."""
-
-    position: Point
-    heading: float
-    pitch: float
-    """Toe up is positive [rad]."""
-    lift: float
-    toe_bend: float
+        return centre + turn("y", heading) @ [sign(side) * self.width, 0.0, 0.0], heading
 
 
 def walk(figure: Figure, gait: Gait) -> Motion:
@@ -111,21 +75,21 @@ def walk(figure: Figure, gait: Gait) -> Motion:
         bob = -0.050 + 0.020 * np.cos(4 * np.pi * (phase - 0.31))
         sway = np.cos(2 * np.pi * (phase - 0.31))
         twist = np.cos(2 * np.pi * (phase - 0.03))
-        facing = _turn("y", heading)
+        facing = turn("y", heading)
         pelvis = centre + facing @ [0.018 * sway, figure.standing[1] + bob, 0.0]
-        root = facing @ _turn("y", -0.10 * twist) @ _turn("z", -0.035 * sway) @ _turn("x", 0.03)
+        root = facing @ turn("y", -0.10 * twist) @ turn("z", -0.035 * sway) @ turn("x", 0.03)
         pose = poses[frame]
-        for side in _LEGS:
+        for side in LEGS:
             foot = _foot_at(gait, side, phase + _phase_lag(side))
-            ankle, rotation = _ankle_of(figure, side, foot)
-            _bend_leg(figure, side, pose, (pelvis, root), (ankle, rotation))
-            pose[_LEGS[side][3], 0] = foot.toe_bend
+            ankle, rotation = ankle_of(figure, side, foot)
+            bend_leg(figure, side, pose, (pelvis, root), (ankle, rotation))
+            pose[LEGS[side][3], 0] = foot.toe_bend
         swing = 0.42 * np.cos(2 * np.pi * (phase - 0.05))
         _lower_arms(pose, left=-swing, right=swing)
         for joint in ("spine1", "spine2", "spine3"):
             pose[_joint(joint), 1] = 0.06 * twist
         pose[_joint("head"), 1] = -0.05 * twist
-        pose[0], positions[frame] = _vector(root), pelvis - figure.joints[0]
+        pose[0], positions[frame] = vector(root), pelvis - figure.joints[0]
     return Motion(poses, positions, fps=FPS)
 
 
@@ -136,12 +100,9 @@ def arm_raise(figure: Figure) -> Motion:
     _set_pair(top, "collar", (0.0, 0.0, np.radians(22)))
     base = np.zeros((24, 3))
     _lower_arms(base)
-    rest = np.zeros((24, 3))
 
     def upper(pose: Pose, amount: float) -> None:
-        # Through the T-pose: from hanging to overhead the shortest arc would pass in front of the body.
-        first, second = min(2 * amount, 1.0), max(2 * amount - 1, 0.0)
-        pose[:] = _blend(base, rest, first) if second == 0 else _blend(rest, top, second)
+        pose[:] = _blend(base, top, amount)
 
     return _on_the_spot(figure, upper, sink=0.004)
 
@@ -161,7 +122,7 @@ def arms_crossed(figure: Figure) -> Motion:
     _lower_arms(base)
 
     def upper(pose: Pose, amount: float) -> None:
-        pose[:] = _blend(base, crossed, _ease(1.4 * amount))
+        pose[:] = _blend(base, crossed, amount)
 
     return _on_the_spot(figure, upper, sink=0.004)
 
@@ -196,16 +157,16 @@ def _on_the_spot(
     count = round(_HOLD * FPS)
     poses, positions = np.zeros((count, 24, 3)), np.zeros((count, 3))
     for frame in range(count):
-        amount = float(_ease(1 - abs(2 * frame / (count - 1) - 1)))
+        amount = _ease(1 - abs(2 * frame / (count - 1) - 1))
         pose = poses[frame]
         upper(pose, amount)
-        pelvis = figure.standing + [0.0, -depth * amount - sink, -depth / 3 * amount]
-        root = _turn("x", 1.15 * depth * amount)
-        for side, (_, _, ankle, _) in _LEGS.items():
-            outward = _sign(side) * np.array(stance)
-            target = figure.joints[ankle] - [0.0, figure.floor, 0.0] + [outward[0], 0.0, 0.0]
-            _bend_leg(figure, side, pose, (pelvis, root), (target, _turn("y", outward[1])))
-        pose[0], positions[frame] = _vector(root), pelvis - figure.joints[0]
+        pelvis = figure.standing - [0.0, sink + depth * amount, depth / 3 * amount]
+        root = turn("x", 1.15 * depth * amount)
+        for side, (_, _, ankle, _) in LEGS.items():
+            apart, toes_out = sign(side) * np.array(stance)
+            target = figure.joints[ankle] + np.array([apart, -figure.floor, 0.0])
+            bend_leg(figure, side, pose, (pelvis, root), (target, turn("y", toes_out)))
+        pose[0], positions[frame] = vector(root), pelvis - figure.joints[0]
     return Motion(poses, positions, fps=FPS)
 
 
@@ -214,7 +175,7 @@ def _foot_at(gait: Gait, side: str, cycle: float) -> FootPlacement:
     step, part = np.floor(cycle), cycle % 1
     position, heading = gait.footprint(side, step)
     if part < _STANCE:
-        rolling = float(_ease((part - 0.38) / (_STANCE - 0.38))) ** 1.2
+        rolling = _ease((part - 0.38) / (_STANCE - 0.38)) ** 1.2
         pitch = _TOE_UP * (1 - _ease(part / 0.10)) + _HEEL_UP * rolling
         return FootPlacement(position, heading, pitch, lift=0.0, toe_bend=min(pitch, 0.0))
     swing = (part - _STANCE) / (1 - _STANCE)
@@ -230,56 +191,13 @@ def _foot_at(gait: Gait, side: str, cycle: float) -> FootPlacement:
     )
 
 
-def _ankle_of(figure: Figure, side: str, foot: FootPlacement) -> tuple[Point, Matrix]:
-    """Ankle position and foot rotation: the foot turns about its heel (toe up) or its ball (heel up)."""
-    _, _, ankle, ball_joint = _LEGS[side]
-    joints = figure.joints
-    rotation = _turn("y", foot.heading) @ _turn("x", -foot.pitch)
-    ball = np.array([joints[ball_joint, 0], figure.floor, joints[ball_joint, 2]])
-    pivot = figure.heels[side] if foot.pitch > 0 else ball
-    # The print lies 3 cm in front of the ankle; ball and heel follow from it, flat on the floor.
-    ball_ahead = np.array([0.0, 0.0, joints[ball_joint, 2] - joints[ankle, 2] - 0.03])
-    world_pivot = (
-        foot.position + _turn("y", foot.heading) @ (ball_ahead + pivot - ball) + [0.0, foot.lift, 0.0]
-    )
-    return world_pivot + rotation @ (joints[ankle] - pivot), rotation
-
-
-def _bend_leg(
-    figure: Figure, side: str, pose: Pose, pelvis: tuple[Point, Matrix], ankle: tuple[Point, Matrix]
-) -> None:
-    """Set hip, knee and ankle so that the ankle joint and the foot are where they should be.
-
-    The knee turns about x alone, by the angle that gives the leg the right length
-    ``|thigh + R_x shin|``; the hip then points the leg at the target by the smallest rotation.
-    """
-    hip, knee, heel, _ = _LEGS[side]
-    joints = figure.joints
-    position, root = pelvis
-    target, foot = ankle
-    thigh, shin = joints[knee] - joints[hip], joints[heel] - joints[knee]
-    reach = target - (position + root @ (joints[hip] - joints[0]))
-    longest = np.hypot(np.linalg.norm(thigh[1:]) + np.linalg.norm(shin[1:]), thigh[0] + shin[0])
-    length = min(float(np.linalg.norm(reach)), _LEG_REACH * longest)
-    # |thigh + R_x(t) shin|² = length² is cosine cos(t) + sine sin(t) + rest = 0.
-    cosine = 2 * (thigh[1] * shin[1] + thigh[2] * shin[2])
-    sine = 2 * (thigh[2] * shin[1] - thigh[1] * shin[2])
-    rest = thigh @ thigh + shin @ shin + 2 * thigh[0] * shin[0] - length**2
-    middle, spread = np.arctan2(sine, cosine), np.arccos(np.clip(-rest / np.hypot(cosine, sine), -1, 1))
-    bend = middle + spread  # of the two solutions the one in which the knee points forward
-    hip_world = _shortest_turn(root @ (thigh + _turn("x", bend) @ shin), reach) @ root
-    pose[hip] = _vector(root.T @ hip_world)
-    pose[knee] = [bend, 0.0, 0.0]
-    pose[heel] = _vector((hip_world @ _turn("x", bend)).T @ foot)
-
-
 def _lower_arms(pose: Pose, *, left: float = 0.0, right: float = 0.0, bend: float = 0.25) -> None:
     """Let the arms hang, swung forward by an angle each; the elbow bends more when forward [rad]."""
     for side, swing in (("left", left), ("right", right)):
-        sign = _sign(side)
-        pose[_joint(f"{side}_collar")] = [0.0, 0.0, -sign * np.radians(8)]
-        pose[_joint(f"{side}_shoulder")] = _vector(_turn("x", -swing) @ _turn("z", -sign * np.radians(66)))
-        pose[_joint(f"{side}_elbow")] = [0.0, -sign * (bend + 0.5 * max(swing, 0.0)), 0.0]
+        outward = sign(side)
+        pose[_joint(f"{side}_collar")] = [0.0, 0.0, -outward * np.radians(8)]
+        pose[_joint(f"{side}_shoulder")] = vector(turn("x", -swing) @ turn("z", -outward * np.radians(66)))
+        pose[_joint(f"{side}_elbow")] = [0.0, -outward * (bend + 0.5 * max(swing, 0.0)), 0.0]
 
 
 def _set_pair(pose: Pose, joint: str, left: tuple[float, float, float]) -> None:
@@ -300,28 +218,8 @@ def _ease(value: float) -> float:
     return clipped * clipped * (3 - 2 * clipped)
 
 
-def _shortest_turn(start: Point, end: Point) -> Matrix:
-    axis = np.cross(start, end)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return np.eye(3)
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, start @ end)).as_matrix()
-
-
-def _turn(axis: str, angle: float) -> Matrix:
-    return Rotation.from_euler(axis, angle).as_matrix()
-
-
-def _vector(matrix: Matrix) -> Point:
-    return Rotation.from_matrix(matrix).as_rotvec()
-
-
 def _joint(name: str) -> int:
     return JOINT_NAMES.index(name)
-
-
-def _sign(side: str) -> int:
-    return 1 if side == "left" else -1
 
 
 def _phase_lag(side: str) -> float:
@@ -344,9 +242,10 @@ def shipped_motions(body: Body) -> dict[str, Motion]:
 def _write(motion: Motion, path: Path) -> None:
     poses = motion.poses.reshape(len(motion), 72).astype(np.float32)
     translation = motion.translation.astype(np.float32)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+    unfinished = path.with_suffix(".npz.tmp")
+    with unfinished.open("wb") as file:
         np.savez_compressed(file, poses=poses, trans=translation, mocap_framerate=motion.fps, up="y")
-    os.replace(file.name, path)
+    os.replace(unfinished, path)
 
 
 def main() -> None:
