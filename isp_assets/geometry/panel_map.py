@@ -87,7 +87,9 @@ class PanelSampler:
     @property
     def inside(self) -> Bool[Tensor, "2 R R"]:
         """Which texel centres lie inside the front and the back panel."""
-        mask = torch.zeros(PANEL_COUNT * self.resolution**2, dtype=torch.bool, device=self.inside_texel.device)
+        mask = torch.zeros(
+            PANEL_COUNT * self.resolution**2, dtype=torch.bool, device=self.inside_texel.device
+        )
         mask[self.inside_texel] = True
         return mask.reshape(PANEL_COUNT, self.resolution, self.resolution)
 

@@ -1,0 +1,189 @@
+"""Train the diffused skinning field ``w(v)`` of one body.
+
+The target spreads the body's surface smoothly into space: at distance ``d`` from the
+skin, a point takes part in all body vertices by a Gaussian of its distance to them,
+of width ``sqrt(base² + (growth d)²)``, and by the area they stand for. On the skin
+that is the local surface; half a leg's length away, both legs and the pelvis alike.
+
+Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
+Implicit Sewing Patterns", NeurIPS 2023, Eqs. 6-7.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.body import Body
+from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
+from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
+from isp_assets.train.loop import RunOptions, RunReport, train
+
+_HELD_OUT = 1500
+_STEP = 0.005  # length over which smoothness is measured [m]
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """How far the surface's weights spread, and where the field is sampled."""
+
+    base: float = 0.025
+    """Kernel width on the skin [m]."""
+    growth: float = 0.8
+    """Kernel width per distance from the skin."""
+    reach: float = 0.4
+    """Largest offset of a sample from the skin [m]; a wide skirt is that far away."""
+    samples: int = 60_000
+    """Sample points per rest pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points around the body in one rest pose."""
+
+    points: Float[Tensor, "P 3"]
+    width: Float[Tensor, " P"]
+    """Kernel width of the target [m]."""
+
+    def take(self, index: Tensor | slice) -> "Samples":
+        return Samples(self.points[index], self.width[index])
+
+
+class SkinTask:
+    """What `train` needs: the field, its target, losses and metrics."""
+
+    name = "skin"
+
+    def __init__(self, body: Body, config: SkinFieldConfig, diffusion: Diffusion, *, seed: int = 0) -> None:
+        self.body, self.diffusion = body, diffusion
+        self.config: Mapping[str, Any] = {
+            "field": config.to_dict(), "diffusion": asdict(diffusion), "body": body.sha256,
+        }  # fmt: skip
+        poses = torch.tensor(config.rest_poses).unflatten(1, (24, 3))
+        self.surfaces = body.pose(poses).vertices
+        self.area = _vertex_area(body)
+        self.module = SkinField(config)
+        self.module.place_on(self.surfaces, self.area)
+        rng = np.random.default_rng(seed)
+        drawn = [self._draw(surface, rng) for surface in self.surfaces]
+        self.pools = [samples.take(slice(_HELD_OUT, None)) for samples in drawn]
+        self.held_out = [samples.take(slice(_HELD_OUT)) for samples in drawn]
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        return [{"params": list(self.module.parameters()), "lr": 2e-3}]
+
+    def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
+        """Squared log ratio of the kernel widths; with a head, also the cross-entropy of the weights."""
+        config, terms = self.module.config, {}
+        width_loss, entropy = 0.0, 0.0
+        for rest, pool in enumerate(self.pools):
+            if config.kernel:
+                batch = pool.take(torch.randint(len(pool.points), (4096,), generator=generator))
+                ratio = self.module.log_width(batch.points, rest=rest) - batch.width.log()
+                width_loss = width_loss + ratio.square().mean()
+            if config.rank:
+                batch = pool.take(torch.randint(len(pool.points), (256,), generator=generator))
+                log_weights = self.module.logits(batch.points, rest=rest).log_softmax(-1)
+                entropy = entropy - (self.target(batch, rest=rest) * log_weights).sum(-1).mean()
+        if config.kernel:
+            terms["width"] = width_loss
+        if config.rank:
+            terms["entropy"] = 0.01 * entropy
+        return terms
+
+    def target(self, samples: Samples, *, rest: int) -> Float[Tensor, "P N"]:
+        """The weights that the field should give."""
+        square = torch.cdist(samples.points, self.surfaces[rest]).square()
+        return (self.area.log() - 0.5 * square / samples.width[:, None].square()).softmax(-1)
+
+    def measure(self) -> dict[str, float]:
+        """Errors of what is folded out of the weights, and their steepness, on held-out points."""
+        figures = [self._measure(samples, rest) for rest, samples in enumerate(self.held_out)]
+        return {name: max(f[name] for f in figures) for name in figures[0]}
+
+    def _measure(self, samples: Samples, rest: int) -> dict[str, float]:
+        weights, target = self.module(samples.points, rest=rest), self.target(samples, rest=rest)
+        joint = 0.5 * ((weights - target) @ self.body.weights).abs().sum(-1)
+        count = self.body.shape_dirs.shape[-1]
+        shape = ((weights - target) @ self.body.shape_dirs.flatten(1)).unflatten(1, (3, count)).norm(dim=1)
+        pose = ((weights - target) @ self.body.pose_dirs.mean(-1)).norm(dim=-1) * 207**0.5
+        beside = samples.points + _STEP * torch.nn.functional.normalize(torch.ones(3), dim=0)
+        change = 0.5 * ((self.module(beside, rest=rest) - weights) @ self.body.weights).abs().sum(-1)
+        return {
+            "joint_weight_error_mean": float(joint.mean()),
+            "joint_weight_error_p95": float(joint.quantile(0.95)),
+            "shape_error_mm_p95": 1e3 * float(shape.quantile(0.95)),
+            "pose_error_mm_p95": 1e3 * float(pose.quantile(0.95)),
+            "joint_weight_change_per_cm_p99": float(change.quantile(0.99)) * 0.01 / _STEP,
+        }
+
+    def _draw(self, surface: Float[Tensor, "N 3"], rng: np.random.Generator) -> Samples:
+        """A fifth of the points on the skin, the rest at log-uniform offsets in directions around the normal."""
+        count = self.diffusion.samples + _HELD_OUT
+        vertices, faces = surface.double().numpy(), self.body.faces.numpy()
+        corner = vertices[faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        doubled = np.linalg.norm(normal, axis=1)
+        face = rng.choice(len(faces), count, p=doubled / doubled.sum())
+        point = (corner[face] * rng.dirichlet((1, 1, 1), count)[..., None]).sum(1)
+        direction = normal[face] / doubled[face, None] + 0.7 * rng.normal(size=(count, 3))
+        offset = np.exp(rng.uniform(np.log(0.003), np.log(self.diffusion.reach), count))
+        near = rng.random(count) < 0.2
+        offset[near] = rng.uniform(-0.01, 0.01, near.sum())
+        point += offset[:, None] * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        query = ClosestQuery(vertices, SurfaceTopology.build(faces, len(vertices)))
+        distance = query(point).height
+        width = np.hypot(self.diffusion.base, self.diffusion.growth * distance)
+        return Samples(torch.from_numpy(point).float(), torch.from_numpy(width).float())
+
+
+def train_skin(
+    out: Path,
+    options: RunOptions,
+    *,
+    body: Body,
+    rest_poses: Sequence[Float[np.ndarray, "24 3"]],
+    diffusion: Diffusion | None = None,
+    config: SkinFieldConfig | None = None,
+) -> RunReport:
+    """Train a skin field and write ``skin.safetensors`` into ``out``.
+
+    Args:
+        out: Folder; also takes the checkpoint and the history.
+        options: Budget and device; a field this small needs about three minutes on one core.
+        body: The body whose weights are diffused.
+        rest_poses: Every pose in which garments are modelled.
+        diffusion: How the weights spread.
+        config: Size of the field; its vertex count and poses are replaced by those given here.
+    """
+    from dataclasses import replace
+
+    from isp_assets.bundle import SkinBundle
+
+    poses = tuple(tuple(float(x) for x in np.asarray(pose).reshape(-1)) for pose in rest_poses)
+    config = config or SkinFieldConfig(num_vertices=len(body.template))
+    task = SkinTask(
+        body, replace(config, num_vertices=len(body.template), rest_poses=poses), diffusion or Diffusion()
+    )
+    report = train(task, out, options)
+    provenance = {"steps": report.steps, "seconds": round(report.seconds, 1), "config": dict(task.config)}
+    bundle = SkinBundle(
+        task.module, body_sha256=body.sha256, provenance=provenance, metrics=dict(report.metrics)
+    )
+    bundle.save(Path(out) / "skin.safetensors")
+    return report
+
+
+def _vertex_area(body: Body) -> Float[Tensor, " N"]:
+    """A third of the area of the faces around each vertex [m²]."""
+    corner = body.template[body.faces]
+    doubled = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(dim=-1)
+    area = torch.zeros(len(body.template))
+    for k in range(3):
+        area.index_add_(0, body.faces[:, k], doubled / 6)
+    return area
