@@ -85,7 +85,25 @@ class Closest:
 class ClosestQuery:
     """A surface in one frame, ready for closest-point queries (a tree of boxes, built once, used often)."""
 
-    def __init__(self, vertices: Float[np.ndarray, "V 3"], topology: SurfaceTopology) -> None:
+    def __init__(
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        topology: SurfaceTopology,
+        *,
+        subset: Int[np.ndarray, " n"] | None = None,
+        face_normals: Float[np.ndarray, "F 3"] | None = None,
+    ) -> None:
+        """Build the tree.
+
+        Args:
+            vertices: Positions in this frame [m].
+            topology: Connectivity.
+            subset: Search these faces only; sides and borders remain those of the whole surface.
+            face_normals: Unit normals of all faces, where the caller has them already.
+
+        Raises:
+            GeometryError: If the positions do not fit the topology or are not finite.
+        """
         if len(vertices) != len(topology.border_vertex):
             count = len(topology.border_vertex)
             raise GeometryError(f"surface has {count} vertices, got {len(vertices)} positions")
@@ -93,11 +111,13 @@ class ClosestQuery:
             raise GeometryError("surface positions hold NaN or infinity; check the step before")
         self.vertices = np.ascontiguousarray(vertices, np.float64)
         self.topology = topology
+        self._subset = subset
+        self._searched = topology.faces if subset is None else np.ascontiguousarray(topology.faces[subset])
         self._tree = igl.AABB()
-        self._tree.init(self.vertices, topology.faces)
-        corner = self.vertices[topology.faces]
-        cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        self.face_normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+        self._tree.init(self.vertices, self._searched)
+        self.face_normals = (
+            unit_face_normals(self.vertices, topology.faces) if face_normals is None else face_normals
+        )
 
     def __call__(self, points: Float[np.ndarray, "P 3"]) -> Closest:
         """Closest point, side and pseudonormal of every query point."""
@@ -105,8 +125,10 @@ class ClosestQuery:
             empty = np.zeros((0, 3))
             return Closest(empty, np.zeros(0, np.int64), empty, empty, np.zeros(0), np.zeros(0, bool))
         points = np.ascontiguousarray(points, np.float64)
-        squared, face, closest = self._tree.squared_distance(self.vertices, self.topology.faces, points)
+        squared, face, closest = self._tree.squared_distance(self.vertices, self._searched, points)
         face, closest = face.reshape(-1).astype(np.int64), closest.reshape(-1, 3)  # igl gives C's long long
+        if self._subset is not None:
+            face = self._subset[face]
         weights = _barycentric(closest, self.vertices[self.topology.faces[face]])
         normal, on_border = self._pseudonormals(face, weights)
         side = np.where(((points - closest) * normal).sum(1) < 0, -1.0, 1.0)
@@ -150,6 +172,15 @@ class ClosestQuery:
         angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
         weighted = self.face_normals[face] * angle[:, None]
         return np.stack([np.bincount(owner, weighted[:, i], minlength=len(vertex)) for i in range(3)], axis=1)
+
+
+def unit_face_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Unit normals of faces; zero for a face without area."""
+    first, second, third = (vertices[corner] for corner in faces.T)
+    cross = np.cross(second - first, third - first)
+    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
 
 
 def signed_heights(

@@ -1,0 +1,40 @@
+"""Pairs of triangles of two meshes that cross, by exact predicates."""
+
+import numpy as np
+from igl import predicates
+from jaxtyping import Float, Int
+
+
+def crossing_pairs(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    other_vertices: Float[np.ndarray, "W 3"],
+    other_faces: Int[np.ndarray, "G 3"],
+) -> Int[np.ndarray, "n 2"]:
+    """All pairs (face, other face) that share a point; touching counts.
+
+    Faces outside the other mesh's bounding box are put aside first, so meshes that
+    lie apart cost next to nothing.
+    """
+    low = np.maximum(vertices.min(0), other_vertices.min(0))
+    high = np.minimum(vertices.max(0), other_vertices.max(0))
+    mine, theirs = (
+        _inside_box(vertices, faces, low, high),
+        _inside_box(other_vertices, other_faces, low, high),
+    )
+    if len(mine) == 0 or len(theirs) == 0:
+        return np.zeros((0, 2), np.int64)
+    _, pairs, _ = predicates.find_intersections(
+        np.ascontiguousarray(vertices, np.float64),
+        np.ascontiguousarray(faces[mine], np.int64),
+        np.ascontiguousarray(other_vertices, np.float64),
+        np.ascontiguousarray(other_faces[theirs], np.int64),
+    )
+    pairs = pairs.reshape(-1, 2)
+    return np.stack([mine[pairs[:, 0]], theirs[pairs[:, 1]]], axis=1)
+
+
+def _inside_box(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Faces whose own bounding box meets the box."""
+    corner = vertices[faces]
+    return np.flatnonzero(((corner.max(1) >= low) & (corner.min(1) <= high)).all(1))

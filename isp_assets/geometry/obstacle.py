@@ -1,0 +1,164 @@
+"""Surfaces split into body parts, so that contact is sought where it makes sense.
+
+The nearest point of a body to a sleeve may lie on the torso, and a push towards it
+would drag the sleeve through the arm. So every vertex of the body and of a garment
+knows the parts it belongs to (from its skinning weights), and closest points are
+sought on faces that share a part with the query point (*own* contact) or on those
+that share none (*foreign* contact, meant for shallow touches only).
+
+Positions are in metres, in one shared space. NumPy; one frame at a time.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceTopology, unit_face_normals
+
+BODY_PARTS: dict[str, tuple[int, ...]] = {
+    "torso": (0, 3, 6, 9, 13, 14),
+    "head": (12, 15),
+    "left_arm": (16, 18, 20, 22),
+    "right_arm": (17, 19, 21, 23),
+    "left_leg": (1, 4, 7, 10),
+    "right_leg": (2, 5, 8, 11),
+}
+"""Joints of each part."""
+
+_BELONGS = 0.08  # weight from which a vertex belongs to a part; low, so that parts overlap at their seams
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionMesh:
+    """Static collision data of a body or a garment; built once, used in every frame."""
+
+    topology: SurfaceTopology
+    parts: Bool[np.ndarray, "V 6"]
+    """Which of `BODY_PARTS` each vertex belongs to; at least one."""
+    part_faces: tuple[Int[np.ndarray, " _"], ...]
+    """Faces of each part; parts overlap."""
+
+    @classmethod
+    def build(
+        cls, faces: Int[np.ndarray, "F 3"], joint_weights: Float[np.ndarray, "V 24"]
+    ) -> "CollisionMesh":
+        """Sort a mesh into parts.
+
+        Args:
+            faces: Triangles, wound so that normals point away from the body.
+            joint_weights: Skinning weights; rows sum to 1.
+
+        Raises:
+            GeometryError: If the mesh is no surface.
+        """
+        weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
+        parts = weight >= _BELONGS
+        parts[np.arange(len(parts)), weight.argmax(1)] = True
+        topology = SurfaceTopology.build(faces, len(joint_weights))
+        of_face = parts[topology.faces].any(1)
+        return cls(topology, parts, tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS))))
+
+
+class Obstacle:
+    """A collision mesh in one frame; its search trees are built on first use and shared by all who ask."""
+
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        vertices: Float[np.ndarray, "V 3"],
+        *,
+        margin: float,
+        tight: Bool[np.ndarray, " V"] | None = None,
+    ) -> None:
+        """Place a mesh.
+
+        Args:
+            mesh: Its collision data.
+            vertices: Its positions in this frame [m].
+            margin: Clearance that others keep above it [m].
+            tight: Vertices above which there is no room for cloth; by default found by probing.
+
+        Raises:
+            GeometryError: If the margin is negative.
+        """
+        if margin < 0:
+            raise GeometryError(f"margin must be >= 0 m, got {margin:g}")
+        if tight is not None:
+            self.tight = tight
+        self.mesh = mesh
+        self.vertices = np.ascontiguousarray(vertices, np.float64)
+        self.margin = margin
+        self._queries: dict[int, ClosestQuery] = {}
+
+    @cached_property
+    def face_normals(self) -> Float[np.ndarray, "F 3"]:
+        return unit_face_normals(self.vertices, self.mesh.topology.faces)
+
+    @cached_property
+    def whole(self) -> ClosestQuery:
+        """All parts at once."""
+        return ClosestQuery(self.vertices, self.mesh.topology, face_normals=self.face_normals)
+
+    @cached_property
+    def vertex_normals(self) -> Float[np.ndarray, "V 3"]:
+        """Unit sums of the face normals around each vertex."""
+        faces, count = self.mesh.topology.faces.reshape(-1), len(self.vertices)
+        normals = np.repeat(self.face_normals, 3, axis=0)
+        total = np.stack([np.bincount(faces, normals[:, k], minlength=count) for k in range(3)], axis=1)
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+    @cached_property
+    def tight(self) -> Bool[np.ndarray, " V"]:
+        """Vertices above which there is no room for cloth: a deep crease, or the body touches itself.
+
+        A probe twice the margin above the vertex comes nearer to another place of the surface.
+        Nothing can lie there without cutting the surface, so it is neither lifted hard nor blamed.
+        """
+        probe = self.whole(self.vertices + 2 * self.margin * self.vertex_normals)
+        return probe.height < 0.6 * self.margin
+
+    @cached_property
+    def part_boxes(self) -> Float[np.ndarray, "6 2 3"]:
+        """Bounding box of each part [m]; an empty part has an inverted box, which holds nothing."""
+        boxes = np.full((len(BODY_PARTS), 2, 3), [[np.inf] * 3, [-np.inf] * 3])
+        for part, faces in enumerate(self.mesh.part_faces):
+            if len(faces):
+                corner = self.vertices[self.mesh.topology.faces[faces]].reshape(-1, 3)
+                boxes[part] = corner.min(0), corner.max(0)
+        return boxes
+
+    def contacts(
+        self, points: Float[np.ndarray, "P 3"], parts: Bool[np.ndarray, "P 6"], *, within: float
+    ) -> Closest:
+        """Closest points on faces that share a part with each point.
+
+        Points outside a part's box by more than ``within`` [m] are not sought there; points
+        without any candidate get height +inf, and the point itself as the closest one.
+        """
+        best = Closest(
+            points.copy(), np.zeros(len(points), np.int64), np.zeros_like(points), np.zeros_like(points),
+            np.full(len(points), np.inf), np.zeros(len(points), bool),
+        )  # fmt: skip
+        for part, (low, high) in enumerate(self.part_boxes):
+            near = parts[:, part] & (points >= low - within).all(1) & (points <= high + within).all(1)
+            index = np.flatnonzero(near)
+            if len(index) == 0:
+                continue
+            found = self._query(part)(points[index])
+            closer = np.abs(found.height) < np.abs(best.height[index])
+            for field in ("point", "face", "weights", "normal", "height", "on_border"):
+                getattr(best, field)[index[closer]] = getattr(found, field)[closer]
+        return best
+
+    def _query(self, part: int) -> ClosestQuery:
+        if part not in self._queries:
+            self._queries[part] = ClosestQuery(
+                self.vertices,
+                self.mesh.topology,
+                subset=self.mesh.part_faces[part],
+                face_normals=self.face_normals,
+            )
+        return self._queries[part]
