@@ -39,12 +39,19 @@ class AnimatedMesh:
     vertex_normals: VertexNormals
 
     def set_frame(self, vertices: Float[np.ndarray, "V 3"], frame: int) -> None:
-        """Author points, normals and extent at time code ``frame``."""
+        """Author points, normals and extent at time code ``frame``.
+
+        The first frame is also the default value: programs that ask for no
+        time see the figure standing instead of nothing. The file stores it once.
+        """
         vertices = np.ascontiguousarray(vertices, np.float32)
         points = Vt.Vec3fArray.FromNumpy(vertices)
-        self.points.Set(points, frame)
-        self.normals.Set(Vt.Vec3fArray.FromNumpy(self.vertex_normals(vertices)), frame)
-        self.extent.Set(UsdGeom.PointBased.ComputeExtent(points), frame)
+        normals = Vt.Vec3fArray.FromNumpy(self.vertex_normals(vertices))
+        box = UsdGeom.PointBased.ComputeExtent(points)
+        for attribute, value in ((self.points, points), (self.normals, normals), (self.extent, box)):
+            if not attribute.HasAuthoredValue():
+                attribute.Set(value)
+            attribute.Set(value, frame)
 
 
 def define_shot(

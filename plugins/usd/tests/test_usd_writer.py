@@ -108,6 +108,7 @@ def test_normals_and_extents_move_with_the_points(written: Path) -> None:
         )
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
         np.testing.assert_array_equal(mesh.GetExtentAttr().Get(frame), [points.min(0), points.max(0)])
+    assert np.array_equal(mesh.GetPointsAttr().Get(), mesh.GetPointsAttr().Get(1001))  # asked for no time
     assert not np.array_equal(mesh.GetNormalsAttr().Get(1001), mesh.GetNormalsAttr().Get(1005))
 
 
