@@ -1,0 +1,227 @@
+"""Drape an outfit over a shot: the ladder of solvers, chunk by chunk.
+
+Rungs, in order: ``skin`` (Eqs. 6-7), ``displace`` (D_s), ``layering`` (D_m, Eqs. 9-12),
+``project`` (leaves no contact). Each layer is corrected once against everything
+beneath it, so the cost grows linearly with the number of layers. A rung that a
+frame does not need is skipped there, and the chunk says what ran.
+
+Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
+Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.body import PosedBody
+from isp_assets.conventions import FrameRange
+from isp_assets.displacement import displace, displacements
+from isp_assets.drape_features import drape_features
+from isp_assets.dressing import WornGarment, dress
+from isp_assets.errors import DrapeError
+from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
+from isp_assets.geometry.contact import Surface
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
+from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions, project
+from isp_assets.layering import correct_layer
+from isp_assets.outfit import Outfit
+from isp_assets.shot import DEFAULT_RESOLUTION, Shot
+from isp_assets.skinning import skin_garment
+
+STEPS = ("skin", "displace", "layering", "project")
+
+
+@dataclass(frozen=True)
+class DrapeOptions:
+    """What to run, and where."""
+
+    steps: tuple[str, ...] = STEPS
+    """Rungs to run; ``skin`` is always needed."""
+    resolution: int = DEFAULT_RESOLUTION
+    """Grid cells across a panel, 32 to 512."""
+    chunk: int = 16
+    """Frames held at once."""
+    device: str = "cpu"
+    body_margin: float = BODY_MARGIN
+    """Clearance that projection leaves over the body [m]."""
+    layer_margin: float = LAYER_MARGIN
+    """Clearance that projection leaves over an inner garment [m]."""
+    projection: ProjectionOptions = ProjectionOptions()
+    keep_stages: bool = False
+    """Keep the positions after every rung, to measure what each one did."""
+
+    def __post_init__(self) -> None:
+        unknown = [s for s in self.steps if s not in STEPS]
+        if unknown or "skin" not in self.steps:
+            raise DrapeError(
+                f"steps must be some of {', '.join(STEPS)}, with skin; got {', '.join(self.steps)}"
+            )
+        if self.chunk < 1:
+            raise DrapeError(f"chunk must be at least 1 frame, got {self.chunk}")
+
+
+def drape(outfit: Outfit, shot: Shot, options: DrapeOptions | None = None) -> DrapedFrames:
+    """Drape an outfit over a shot.
+
+    Decoding and binding happen here; frames are draped while the result is iterated.
+
+    Args:
+        outfit: Garments, innermost first.
+        shot: The body in motion.
+        options: Rungs, device, chunk size.
+
+    Raises:
+        DrapeError: If the shot's body is not the outfit's, or a result is not finite.
+        DecodeError: If a code gives no valid garment.
+    """
+    options = options or DrapeOptions()
+    if shot.body.sha256 != outfit.body_sha256:
+        raise DrapeError(
+            f"shot {shot.name!r}: body {shot.body.name!r} ({shot.body.sha256[:12]}) is not the body that the outfit "
+            f"was trained on ({outfit.body_sha256[:12]})"
+        )
+    draper = _Draper(outfit, shot, options)
+    return DrapedFrames(draper.scene, draper.chunks())
+
+
+class _Draper:
+    """The state of one shot: static data, and one chunk at a time."""
+
+    def __init__(self, outfit: Outfit, shot: Shot, options: DrapeOptions) -> None:
+        self.shot, self.options = shot, options
+        self.body = shot.body.to(options.device)
+        self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
+        self.worn = dress(outfit, self.body, resolution=options.resolution, device=options.device)
+        self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
+        numbers = shot.motion.frames
+        self.scene = Scene(
+            name=shot.name,
+            body_faces=shot.body.faces.numpy(),
+            layers=tuple(w.layer for w in self.worn),
+            frames=FrameRange(int(numbers[0]), int(numbers[-1]), shot.motion.frame_step),
+            fps=shot.motion.fps,
+        )
+
+    def chunks(self) -> Iterator[FrameChunk]:
+        for start in range(0, len(self.shot.motion), self.options.chunk):
+            yield self._chunk(slice(start, start + self.options.chunk))
+
+    @torch.no_grad()
+    def _chunk(self, rows: slice) -> FrameChunk:
+        motion, device = self.shot.motion, self.options.device
+        state = _ChunkState()
+        with state.timed("body"):
+            posed = self.body.pose(
+                torch.as_tensor(motion.poses[rows], dtype=torch.float32, device=device),
+                betas=self.betas,
+                translation=torch.as_tensor(motion.translation[rows], dtype=torch.float32, device=device),
+            )
+        skin = posed.vertices.cpu().numpy()
+        state.beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
+        margin = self.options.body_margin
+        state.obstacles = [[Obstacle(self.body_collision, v, margin=margin)] for v in skin]
+        layers = tuple(self._layer(index, worn, posed, state) for index, worn in enumerate(self.worn))
+        frames = motion.frames[rows]
+        self._check_finite(layers, frames)
+        return FrameChunk(
+            frames=frames,
+            body=skin,
+            layers=layers,
+            times=StageTimes(state.seconds),
+            stages={name: tuple(positions) for name, positions in state.stages.items()},
+            steps=tuple(tuple(tuple(layer[t]) for layer in state.steps) for t in range(len(frames))),
+        )
+
+    def _layer(
+        self, index: int, worn: WornGarment, posed: PosedBody, state: "_ChunkState"
+    ) -> Float[np.ndarray, "T V 3"]:
+        steps, keep = self.options.steps, self.options.keep_stages
+        ran: list[list[str]] = [["skin"] for _ in range(len(posed.vertices))]
+        with state.timed("skin"):
+            vertices, rotations = skin_garment(worn.skin, posed, self.betas)
+        state.keep("skin", vertices, keep)
+        if "displace" in steps and worn.displacement is not None and worn.field is not None:
+            with state.timed("displace"):
+                features = drape_features(posed, self.betas, worn.code, num_betas=worn.field.config.num_betas)
+                moved = displacements(worn.displacement, worn.field, features)
+                vertices = displace(vertices, rotations, moved)
+            _note(ran, "displace")
+        state.keep("displace", vertices, keep)
+        if "layering" in steps and worn.layering is not None and index > 0:
+            with state.timed("layering"):
+                vertices, touched = correct_layer(
+                    worn.layering, vertices, state.beneath, posed, ramp=worn.ramp
+                )
+            _note(ran, "layering", touched)
+        state.keep("layering", vertices, keep)
+        result = vertices.cpu().numpy()
+        if "project" in steps:
+            with state.timed("project"):
+                result = self._project(worn, result, state, ran)
+        state.steps.append(ran)
+        outside = torch.as_tensor(result, device=vertices.device)
+        state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
+        for obstacles, positions in zip(state.obstacles, result, strict=True):
+            obstacles.append(Obstacle(worn.collision, positions, margin=self.options.layer_margin))
+        return result
+
+    def _project(
+        self,
+        worn: WornGarment,
+        vertices: Float[np.ndarray, "T V 3"],
+        state: "_ChunkState",
+        ran: list[list[str]],
+    ) -> Float[np.ndarray, "T V 3"]:
+        result = np.empty_like(vertices)
+        for t, obstacles in enumerate(state.obstacles):
+            if not np.isfinite(vertices[t]).all():
+                raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
+            done = project(vertices[t], worn.collision, obstacles, self.options.projection)
+            result[t] = done.vertices
+            if done.ran:
+                ran[t].append("project")
+        return result
+
+    def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
+        for worn, positions in zip(self.worn, layers, strict=True):
+            bad = ~np.isfinite(positions).all((1, 2))
+            if bad.any():
+                raise DrapeError(
+                    f"layer {worn.layer.name}: positions are not finite in frame {frames[bad][0]}; "
+                    "the pose, betas or code lies far outside the trained range"
+                )
+
+
+class _ChunkState:
+    """What the layers of one chunk hand on to the next layer."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.beneath: list[Surface] = []
+        self.obstacles: list[list[Obstacle]] = []
+        """Per frame: the body, then every finished layer."""
+        self.stages: dict[str, list[np.ndarray]] = {}
+        self.steps: list[list[list[str]]] = []
+        """Per layer and frame: names of the rungs that ran."""
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def keep(self, stage: str, vertices: Float[Tensor, "T V 3"], wanted: bool) -> None:
+        if wanted:
+            self.stages.setdefault(stage, []).append(vertices.cpu().numpy())
+
+
+def _note(ran: list[list[str]], step: str, where: np.ndarray | None = None) -> None:
+    for t, steps in enumerate(ran):
+        if where is None or where[t]:
+            steps.append(step)
