@@ -1,0 +1,76 @@
+"""What the atlases are trained on: triangles and seam vertices, with their places on the body."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from isp_assets.conventions import PANELS
+from isp_assets.train.dataset import GarmentDataset, TrainingGarment
+
+
+def network_xy(dataset: GarmentDataset, garment: TrainingGarment, side: str) -> Float[np.ndarray, "P 2"]:
+    """Points of a panel in network coordinates."""
+    return (garment.panels[side].xy - dataset.panel_center) / dataset.panel_scale
+
+
+def places(garment: TrainingGarment, side: str) -> Float[np.ndarray, "P 3"]:
+    """Where each point of a panel lies on the rest body [m]."""
+    return garment.rest_vertices[garment.panels[side].vertex_index]
+
+
+def seam_indices(garment: TrainingGarment) -> dict[str, Int[np.ndarray, " n"]]:
+    """By panel, the points that share a vertex with the other panel, in matching order."""
+    _, *points = np.intersect1d(*(garment.panels[side].vertex_index for side in PANELS), return_indices=True)
+    return dict(zip(PANELS, points, strict=True))
+
+
+class AtlasSamples:
+    """All triangles and seam vertices of a dataset, drawn from at random.
+
+    Args:
+        dataset: The garments.
+        device: Where the tensors live.
+    """
+
+    def __init__(self, dataset: GarmentDataset, device: torch.device) -> None:
+        self._triangles: dict[str, _Ragged] = {}
+        seams: list[list[np.ndarray]] = [[] for _ in dataset.garments]
+        for side in PANELS:
+            rows = []
+            for garment, seam in zip(dataset.garments, seams, strict=True):
+                points = np.concatenate([network_xy(dataset, garment, side), places(garment, side)], axis=1)
+                faces = garment.panels[side].faces
+                rows.append(points[faces].reshape(len(faces), 15))
+                seam.append(points[seam_indices(garment)[side]])
+            self._triangles[side] = _Ragged(rows, device)
+        self._seams = _Ragged([np.concatenate(seam, axis=1) for seam in seams], device)
+
+    def triangles(
+        self, side: str, garment: Int[Tensor, " G"], count: int, generator: torch.Generator
+    ) -> Float[Tensor, "G count 3 5"]:
+        """Corners of random triangles: network coordinates, then place on the body [m]."""
+        return self._triangles[side].draw(garment, count, generator).unflatten(-1, (3, 5))
+
+    def seams(
+        self, garment: Int[Tensor, " G"], count: int, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, "G count 5"]]:
+        """The same random seam vertices seen from each panel: network coordinates, then place [m]."""
+        front, back = self._seams.draw(garment, count, generator).split(5, dim=-1)
+        return dict(zip(PANELS, (front, back), strict=True))
+
+
+class _Ragged:
+    """Rows of several garments in one tensor; garments may have different numbers of rows."""
+
+    def __init__(self, rows: list[Float[np.ndarray, "n D"]], device: torch.device) -> None:
+        self._rows = torch.from_numpy(np.concatenate(rows).astype(np.float32)).to(device)
+        self._counts = torch.tensor([len(r) for r in rows])
+        self._starts = self._counts.cumsum(0) - self._counts
+
+    def draw(
+        self, garment: Int[Tensor, " G"], count: int, generator: torch.Generator
+    ) -> Float[Tensor, "G count D"]:
+        share = torch.rand(len(garment), count, generator=generator, dtype=torch.float64)
+        row = self._starts[garment, None] + (share * self._counts[garment, None]).long()
+        return self._rows[row.to(self._rows.device)]
