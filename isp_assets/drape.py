@@ -12,7 +12,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ class DrapeOptions:
     """Clearance that projection leaves over the body [m]."""
     layer_margin: float = LAYER_MARGIN
     """Clearance that projection leaves over an inner garment [m]."""
-    projection: ProjectionOptions = ProjectionOptions()
+    projection: ProjectionOptions = field(default_factory=ProjectionOptions)
     keep_stages: bool = False
     """Keep the positions after every rung, to measure what each one did."""
 
@@ -83,8 +83,8 @@ def drape(outfit: Outfit, shot: Shot, options: DrapeOptions | None = None) -> Dr
     options = options or DrapeOptions()
     if shot.body.sha256 != outfit.body_sha256:
         raise DrapeError(
-            f"shot {shot.name!r}: body {shot.body.name!r} ({shot.body.sha256[:12]}) is not the body that the outfit "
-            f"was trained on ({outfit.body_sha256[:12]})"
+            f"shot {shot.name!r}: body {shot.body.name!r} ({shot.body.sha256[:12]}) is not the body that "
+            f"the outfit was trained on ({outfit.body_sha256[:12]})"
         )
     draper = _Draper(outfit, shot, options)
     return DrapedFrames(draper.scene, draper.chunks())

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from isp_assets.bake import bake_texture
 from isp_assets.body import Body
+from isp_assets.decode import decode_garment
 from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displacement, panel_sampler
 from isp_assets.frames import Layer
 from isp_assets.garment import Garment
@@ -62,7 +63,7 @@ def dress(outfit: Outfit, body: Body, *, resolution: int, device: str = "cpu") -
 def _wear(
     outfit: Outfit, index: int, item: OutfitItem, body: Body, *, resolution: int, device: str
 ) -> WornGarment:
-    garment = item.bundle.decode(item.code, resolution, name=item.name)
+    garment = decode_garment(item.bundle.model, item.code, resolution=resolution, name=item.name)
     skin = bind(garment, body, outfit.skin.skin_field.to(device))
     ramp = anchor_ramp(garment)
     field, displacement = item.bundle.drape_field, None
@@ -86,7 +87,7 @@ def _wear(
 def _layering(outfit: Outfit, garment: Garment, item: OutfitItem, device: str) -> BoundLayering | None:
     if outfit.layering is None:
         return None
-    network = outfit.layering.network.to(device).eval()
+    network = outfit.layering.layering_net.to(device).eval()
     sampler = panel_sampler(garment, item.bundle.model, resolution=network.config.map_size)
     return bind_layering(network, garment, sampler, device=device)
 

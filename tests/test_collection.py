@@ -1,0 +1,121 @@
+"""Collections: the built-in one is complete and lossless; wrong ones are named."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from isp_assets.body import Body
+from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
+from isp_assets.collection import DEFAULT_FOLDER, FILE_NAME, Collection
+from isp_assets.errors import CollectionError, OutfitError
+
+EXPECTED = {"tank_top", "long_sleeved_shirt", "open_jacket", "trousers", "shorts", "a_line_skirt"}
+
+
+@pytest.fixture(scope="module")
+def collection() -> Collection:
+    return Collection.load("default")
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    folder = tmp_path / "mine"
+    shutil.copytree(DEFAULT_FOLDER, folder)
+    return folder
+
+
+def edit(folder: Path, old: str, new: str) -> None:
+    path = folder / FILE_NAME
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_built_in_garments(collection: Collection) -> None:
+    assert len(collection.names()) >= 12
+    assert set(collection.names()) >= EXPECTED
+    assert collection.body_sha256 == Body.load("default").sha256
+
+
+def test_every_built_in_garment_decodes(collection: Collection) -> None:
+    for name in collection.names():
+        item = collection.item(name)
+        garment = item.bundle.decode(item.code, resolution=48)
+        assert garment.num_vertices > 100, name
+        assert garment.seams, name
+
+
+def test_networks_are_trained(collection: Collection) -> None:
+    for file in sorted({e.bundle for e in collection.entries.values()}):
+        bundle = collection.bundle(file)
+        assert bundle.drape_field is not None, file
+        assert bundle.provenance, file
+        assert bundle.metrics, file
+    assert collection.layering is not None
+    assert collection.layering.metrics
+    assert collection.skin.metrics
+
+
+@pytest.mark.parametrize("file", ["top", "skirt", "trousers", "skin", "layering"])
+def test_shipped_bundles_save_to_the_same_bytes(file: str, tmp_path: Path) -> None:
+    kinds = {"skin": SkinBundle, "layering": LayeringBundle}
+    source = DEFAULT_FOLDER / f"{file}.safetensors"
+    kinds.get(file, GarmentBundle).load(source).save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == source.read_bytes()
+
+
+def test_data_folder_stays_small() -> None:
+    size = sum(p.stat().st_size for p in DEFAULT_FOLDER.parent.rglob("*") if p.is_file())
+    assert size < 40e6
+
+
+def test_unknown_garment_names_the_nearest(collection: Collection) -> None:
+    with pytest.raises(CollectionError, match="no garment 'tanktop'; did you mean 'tank_top'"):
+        collection.outfit(["tanktop"])
+
+
+def test_empty_outfit_is_refused(collection: Collection) -> None:
+    with pytest.raises(OutfitError, match="at least one garment"):
+        collection.outfit([])
+
+
+def test_layers_keep_the_order_given(collection: Collection) -> None:
+    outfit = collection.outfit(["open_jacket", "tank_top"])
+    assert [outfit.layer_name(i) for i in range(len(outfit))] == ["L00_open_jacket", "L01_tank_top"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("version = 1", "version = 9", "version 9 is not known"),
+        ('schema = "isp-assets/collection"', 'schema = "x"', "schema must be"),
+        ('skin = "skin.safetensors"', 'skin = "gone.safetensors"', "gone.safetensors"),
+        ('fabric = "knit"', 'fabrik = "knit"', "unknown key 'fabrik'; did you mean 'fabric'"),
+        ('fabric = "knit"', 'fabric = "lace"', "garment 'tank_top': fabric kind must be one of"),
+        ('color = "#e9e4d8"', 'color = "white"', "garment 'tank_top': a colour must look like"),
+    ],
+)
+def test_wrong_collection_file_is_named(copy: Path, old: str, new: str, message: str) -> None:
+    edit(copy, old, new)
+    with pytest.raises(CollectionError, match=message) as caught:
+        Collection.load(copy)
+    assert str(copy) in str(caught.value)
+
+
+def test_missing_folder() -> None:
+    with pytest.raises(CollectionError, match="no such file"):
+        Collection.load("nowhere")
+
+
+def test_bundle_of_another_body_is_refused(copy: Path) -> None:
+    sha256 = Body.load("default").sha256
+    edit(copy, sha256, "0" * 64)
+    with pytest.raises(CollectionError, match=f"trained on body {sha256[:12]}.*000000000000"):
+        Collection.load(copy).item("tank_top")
+
+
+def test_wrong_code_name(copy: Path) -> None:
+    edit(copy, 'code = "tank_top"', 'code = "tank_topp"')
+    with pytest.raises(CollectionError, match="names the code 'tank_topp'"):
+        Collection.load(copy).item("tank_top")
