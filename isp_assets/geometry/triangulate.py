@@ -4,6 +4,7 @@ The lattice is anchored at the origin and mirror-symmetric in x, so the front an
 the back of a garment share their inner points, and the left half mirrors the right.
 """
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -165,35 +166,33 @@ def _crosses(p, q, a, b) -> bool:
     def turn(u, v, w):
         return (v[0] - u[0]) * (w[1] - u[1]) - (v[1] - u[1]) * (w[0] - u[0])
 
-    return turn(p, q, a) * turn(p, q, b) < 0 and turn(a, b, p) * turn(a, b, q) < 0
+    return bool(turn(p, q, a) * turn(p, q, b) < 0 and turn(a, b, p) * turn(a, b, q) < 0)
 
 
 def _recover_edge(points, faces, a: int, b: int, *, where: str) -> None:
     """Flip edges that cross segment ab until ab is an edge (Sloan 1993); changes ``faces`` in place."""
-    for _ in range(200):
-        owners: dict[tuple[int, int], list[int]] = {}
-        for t, face in enumerate(faces.tolist()):
-            for k in range(3):
-                owners.setdefault(tuple(sorted((face[k], face[(k + 1) % 3]))), []).append(t)
-        if tuple(sorted((a, b))) in owners:
-            return
-        flipped = False
-        for (p, q), pair in owners.items():
-            if len(pair) != 2 or {a, b} & {p, q} or not _crosses(points[a], points[b], points[p], points[q]):
-                continue
-            r, s = (int(np.setdiff1d(faces[t], (p, q))[0]) for t in pair)
-            if not _crosses(points[p], points[q], points[r], points[s]):
-                continue  # the two triangles form no convex quadrilateral yet
-            still = _crosses(points[a], points[b], points[r], points[s])
-            if still and flipped:
-                continue
-            pair_faces = np.array([[r, s, p], [s, r, q]])
-            faces[pair] = _counter_clockwise(points, pair_faces)
-            flipped = True
-            break
-        if not flipped:
-            break
-    raise GeometryError(f"{where}: cannot keep the outline edge {a}-{b} near {points[a].round(4).tolist()}; does the outline cross itself?")
+    waiting = deque(_edges_across(points, faces, a, b))
+    budget = 4 * len(waiting) ** 2 + 4
+    while waiting and budget > 0:
+        budget -= 1
+        p, q = waiting.popleft()
+        pair = np.flatnonzero((faces == p).any(axis=1) & (faces == q).any(axis=1))
+        r, s = (int(np.setdiff1d(faces[t], (p, q))[0]) for t in pair)
+        if not _crosses(points[p], points[q], points[r], points[s]):
+            waiting.append((p, q))  # the two triangles are not convex together; another flip will make them so
+            continue
+        faces[pair] = _counter_clockwise(points, np.array([[r, s, p], [s, r, q]]))
+        if _crosses(points[a], points[b], points[r], points[s]):
+            waiting.append((r, s))
+    if waiting:
+        raise GeometryError(f"{where}: cannot keep the outline edge {a}-{b} near {points[a].round(4).tolist()}; does the outline cross itself?")
+
+
+def _edges_across(points, faces, a: int, b: int) -> list[tuple[int, int]]:
+    """Inner edges that cross the segment ab."""
+    directed = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+    inner = directed[(directed[:, 0] < directed[:, 1]) & np.isin(_edge_keys(directed), _edge_keys(directed[:, ::-1]))]
+    return [(int(p), int(q)) for p, q in inner if _crosses(points[a], points[b], points[p], points[q])]
 
 
 def _check_filled(points, faces, loop, *, where: str) -> None:

@@ -83,16 +83,13 @@ class SamplingOptions:
     """How many points of a panel are drawn where; the rest is uniform in [-1, 1]^2."""
 
     points: int = 16000
-    border: float = 0.2
+    border: float = 0.15
     """Share exactly on the border."""
-    near: float = 0.35
-    """Share within ``near_radius`` of the border."""
-    far: float = 0.2
-    """Share within ``far_radius`` of the border."""
+    bands: tuple[tuple[float, float], ...] = ((0.15, 0.005), (0.2, 0.03), (0.2, 0.1))
+    """Share and radius of the points around the border. Too many in the innermost band teach a flat field."""
     corner: float = 0.1
-    """Share within ``far_radius`` of a corner, where labels meet."""
-    near_radius: float = 0.005
-    far_radius: float = 0.03
+    """Share within ``corner_radius`` of a corner, where labels meet."""
+    corner_radius: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,15 +107,12 @@ def sample_panel(outline: Outline, options: SamplingOptions, rng: np.random.Gene
     def around(centres: Float[np.ndarray, "n 2"], radius: float) -> Float[np.ndarray, "n 2"]:
         return centres + rng.uniform(-radius, radius, centres.shape)
 
-    counts = [int(share * options.points) for share in (options.border, options.near, options.far, options.corner)]
     corners = outline.corners if len(outline.corners) else outline.points
-    parts = [
-        outline.draw(counts[0], rng),
-        around(outline.draw(counts[1], rng), options.near_radius),
-        around(outline.draw(counts[2], rng), options.far_radius),
-        around(corners[rng.integers(0, len(corners), counts[3])], options.far_radius),
-        rng.uniform(-1, 1, (options.points - sum(counts), 2)),
-    ]
+    chosen = corners[rng.integers(0, len(corners), int(options.corner * options.points))]
+    parts = [outline.draw(int(options.border * options.points), rng), around(chosen, options.corner_radius)]
+    for share, radius in options.bands:
+        parts.append(around(outline.draw(int(share * options.points), rng), radius))
+    parts.append(rng.uniform(-1, 1, (options.points - sum(map(len, parts)), 2)))
     xy = rng.permutation(np.concatenate(parts).clip(-1, 1))
     distance, label = outline.distance(xy)
     return PanelSamples(xy, distance, label)

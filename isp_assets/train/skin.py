@@ -26,6 +26,7 @@ from isp_assets.train.loop import RunOptions, RunReport, train
 
 _HELD_OUT = 1500
 _STEP = 0.005  # length over which smoothness is measured [m]
+_BENT = np.full((24, 3), 0.4, np.float32)  # a pose [rad] whose corrective shape is measured
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Diffusion:
 
     base: float = 0.025
     """Kernel width on the skin [m]."""
-    growth: float = 0.8
+    growth: float = 1.0
     """Kernel width per distance from the skin."""
     reach: float = 0.4
     """Largest offset of a sample from the skin [m]; a wide skirt is that far away."""
@@ -67,6 +68,7 @@ class SkinTask:
         poses = torch.tensor(config.rest_poses).unflatten(1, (24, 3))
         self.surfaces = body.pose(poses).vertices
         self.area = _vertex_area(body)
+        self.corrective = body.pose_dirs @ body.pose(torch.tensor(_BENT)[None]).pose_feature[0]
         self.module = SkinField(config)
         self.module.place_on(self.surfaces, self.area)
         rng = np.random.default_rng(seed)
@@ -111,7 +113,7 @@ class SkinTask:
         joint = 0.5 * ((weights - target) @ self.body.weights).abs().sum(-1)
         count = self.body.shape_dirs.shape[-1]
         shape = ((weights - target) @ self.body.shape_dirs.flatten(1)).unflatten(1, (3, count)).norm(dim=1)
-        pose = ((weights - target) @ self.body.pose_dirs.mean(-1)).norm(dim=-1) * 207**0.5
+        pose = ((weights - target) @ self.corrective).norm(dim=-1)
         beside = samples.points + _STEP * torch.nn.functional.normalize(torch.ones(3), dim=0)
         change = 0.5 * ((self.module(beside, rest=rest) - weights) @ self.body.weights).abs().sum(-1)
         return {
@@ -123,7 +125,7 @@ class SkinTask:
         }
 
     def _draw(self, surface: Float[Tensor, "N 3"], rng: np.random.Generator) -> Samples:
-        """A fifth of the points on the skin, the rest at log-uniform offsets in directions around the normal."""
+        """A fifth of the points on the skin, the rest at log-uniform offsets roughly along the normal."""
         count = self.diffusion.samples + _HELD_OUT
         vertices, faces = surface.double().numpy(), self.body.faces.numpy()
         corner = vertices[faces]

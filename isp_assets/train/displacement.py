@@ -1,0 +1,227 @@
+"""Train the displacement network D_s of a category, from physics alone (Eq. 8).
+
+A step draws eight poses on one body shape and drapes two garments of the wardrobe in
+them. No draped example is needed: the network learns to lower the energy of what
+skinning gives.
+
+Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
+Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.body import Body, PosedBody
+from isp_assets.bundle import GarmentBundle, SkinBundle
+from isp_assets.displacement import displace
+from isp_assets.drape_features import drape_features
+from isp_assets.errors import TrainError
+from isp_assets.geometry.contact import Surface
+from isp_assets.geometry.energy import Fabric
+from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
+from isp_assets.skinning import shape_garment, skin_garment
+from isp_assets.train.drape_energy import Contact, drape_energies, graded_rest, reference_energy
+from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
+from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
+from isp_assets.train.poses import PoseSource, draw_poses, load_clips
+from isp_assets.train.wardrobe import WardrobeOptions, WornSample, build_wardrobe
+
+_BETA_RANGE = 2.0
+_QUICK_GARMENTS, _TEST_FRAMES = 3, 8
+
+
+@dataclass(frozen=True)
+class DisplacementOptions:
+    """What D_s is trained on."""
+
+    field: DrapeFieldConfig = DrapeFieldConfig()
+    """Size; its code size and code scale are replaced by the bundle's."""
+    wardrobe: WardrobeOptions = WardrobeOptions()
+    poses: PoseSource = field(default_factory=PoseSource)
+    contact: Contact = Contact()
+    frames: int = 8
+    """Poses a step."""
+    garments: int = 2
+    """Garments a step, all in the same poses."""
+    learning_rate: float = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBatch:
+    """A body shape in some poses, and its skin as an obstacle."""
+
+    betas: Float[Tensor, " B"]
+    posed: PosedBody
+    surface: Surface
+
+
+class DisplacementTask:
+    """What `train` needs: the network, its physics, losses and metrics."""
+
+    def __init__(
+        self, bundle: GarmentBundle, skin: SkinBundle, body: Body, options: DisplacementOptions, *,
+        device: str = "cpu", seed: int = 0,
+    ) -> None:  # fmt: skip
+        codes = np.stack(list(bundle.codes.values()))
+        config = replace(
+            options.field, code_size=codes.shape[1], code_scale=float(1 / max(codes.std(), 1e-6))
+        )
+        torch.manual_seed(seed)
+        self.name = f"drape {bundle.category}"
+        self.config: Mapping[str, Any] = {
+            "field": config.to_dict(), "contact": asdict(options.contact), "body": body.sha256,
+            "wardrobe": asdict(options.wardrobe), "frames": options.frames, "garments": options.garments,
+            "held_out": list(options.poses.held_out), "learning_rate": options.learning_rate,
+        }  # fmt: skip
+        self.options, self.device, self.fabric = options, torch.device(device), Fabric()
+        self.body = body.to(self.device)
+        wardrobe = replace(options.wardrobe, map_size=config.map_size)
+        samples = build_wardrobe(bundle, body, skin.skin_field, wardrobe, seed=seed)
+        self.wardrobe = [sample.to(self.device) for sample in samples]
+        self.clips = load_clips(options.poses)
+        self.module = DrapeField(config).to(self.device)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        rate = self.options.learning_rate
+        maps = [value for name, value in self.module.named_parameters() if not name.startswith("mlp.")]
+        return [
+            {"params": list(self.module.mlp.parameters()), "lr": rate},
+            {"params": maps, "lr": 2 * rate},
+        ]
+
+    def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
+        """The terms of Eq. 8 on a scale on which hard poses do not drown the others."""
+        poses = draw_poses(list(self.clips.train.values()), self.options.frames, generator)
+        betas = _BETA_RANGE * (2 * torch.rand(self.module.config.num_betas, generator=generator) - 1)
+        batch = self.pose(poses, betas)
+        basis, mean = self.module.maps()
+        chosen = torch.randint(len(self.wardrobe), (self.options.garments,), generator=generator)
+        stiffness = self.options.contact.at(progress)
+        totals: dict[str, Tensor] = {}
+        for index in chosen.tolist():
+            sample = self.wardrobe[index]
+            vertices = self.drape(sample, batch, maps=(basis, mean))
+            for name, value in self._scaled(sample, vertices, batch, stiffness).items():
+                totals[name] = totals.get(name, 0.0) + value / len(chosen)
+        return totals
+
+    def pose(self, poses: Float[Tensor, "T 24 3"], betas: Float[Tensor, " B"]) -> PosedBatch:
+        """Pose the body; only its tilt matters, so it stays at the origin."""
+        with torch.no_grad():
+            betas = betas.to(self.device)
+            posed = self.body.pose(poses.to(self.device), betas=betas)
+            return PosedBatch(betas, posed, Surface.of_mesh(posed.vertices, self.body.faces))
+
+    def drape(
+        self, sample: WornSample, batch: PosedBatch, *, maps: tuple[Tensor, Tensor] | None
+    ) -> Float[Tensor, "T V 3"]:
+        """Skin a garment and, given the network's maps, displace it; differentiable in the network."""
+        with torch.no_grad():
+            vertices, linear = skin_garment(sample.bound, batch.posed, batch.betas)
+        if maps is None:
+            return vertices
+        basis, mean = maps
+        features = drape_features(
+            batch.posed, batch.betas, sample.code, num_betas=self.module.config.num_betas
+        )
+        coefficients = self.module.coefficients(features)
+        drawn = (coefficients @ basis.flatten(1)).unflatten(1, mean.shape) + mean
+        return displace(vertices, linear, sample.sampler.sample(drawn) * sample.ramp)
+
+    def case(self, sample: WornSample, batch: PosedBatch) -> DrapeCase:
+        """What measuring a garment in some poses needs besides its positions."""
+        shaped = shape_garment(sample.bound, batch.betas)
+        rest = graded_rest(sample.rest, sample.bound.canonical, shaped)
+        return DrapeCase(rest, self.fabric, batch.surface, self.options.contact)
+
+    def _scaled(
+        self, sample: WornSample, vertices: Tensor, batch: PosedBatch, stiffness: float
+    ) -> dict[str, Tensor]:
+        case = self.case(sample, batch)
+        terms = drape_energies(
+            vertices, case.rest, self.fabric, batch.surface, case.contact, stiffness=stiffness
+        )
+        reference = reference_energy(case.rest)
+        present = sum(value.detach() for name, value in terms.items() if name != "gravity")
+        # The gradient is that of the energy's square root where the energy is large.
+        weight = (reference * (reference + present)).rsqrt()
+        terms["gravity"] = terms["gravity"] - terms["gravity"].detach()  # its level means nothing
+        return {name: (weight * value).mean() for name, value in terms.items()}
+
+    @torch.no_grad()
+    def measure(self) -> dict[str, float]:
+        """Figures of a few garments on held-out poses, against skinning alone."""
+        return self.measure_on(self.wardrobe[:_QUICK_GARMENTS])
+
+    @torch.no_grad()
+    def measure_on(self, samples: list[WornSample]) -> dict[str, float]:
+        """Mean figures of garments on held-out poses, on the mean body and on two others."""
+        maps, rows = self.module.maps(), []
+        for poses, betas in self.test_batches():
+            batch = self.pose(poses, betas)
+            for sample in samples:
+                case = self.case(sample, batch)
+                row = measure_drape(case, self.drape(sample, batch, maps=None), prefix="skin.")
+                rows.append(row | measure_drape(case, self.drape(sample, batch, maps=maps), prefix=""))
+        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+    def test_batches(self) -> list[tuple[Float[Tensor, "T 24 3"], Float[Tensor, " B"]]]:
+        """Held-out poses (of the training clips if none are held out) on three body shapes."""
+        frames = np.concatenate(list((self.clips.test or self.clips.train).values()))
+        count = self.module.config.num_betas
+        generator = torch.Generator().manual_seed(1)
+        shapes = [torch.zeros(count)]
+        shapes += [_BETA_RANGE * (2 * torch.rand(count, generator=generator) - 1) for _ in range(2)]
+        rows = np.linspace(0, len(frames) - 1, len(shapes) * _TEST_FRAMES).astype(int)
+        return [
+            (torch.tensor(frames[rows[k :: len(shapes)]], dtype=torch.float32), betas)
+            for k, betas in enumerate(shapes)
+        ]
+
+
+def train_displacement(
+    bundle: GarmentBundle, skin: SkinBundle, out: Path, run: RunOptions, *,
+    body: Body, options: DisplacementOptions | None = None,
+) -> GarmentBundle:  # fmt: skip
+    """Train D_s and write ``CATEGORY.safetensors``, the bundle with its displacement network, into ``out``.
+
+    Raises:
+        TrainError: If bundle, skin field and body do not belong together.
+    """
+    for what, digest in (("garment bundle", bundle.body_sha256), ("skin bundle", skin.body_sha256)):
+        if digest != body.sha256:
+            raise TrainError(
+                f"the {what} was made for body {digest[:12]}, the body given is {body.sha256[:12]}; "
+                "give the body that all were trained on"
+            )
+    task = DisplacementTask(
+        bundle, skin, body, options or DisplacementOptions(), device=run.device, seed=run.seed
+    )
+    report = train(task, out, run)
+    metrics = task.measure_on(task.wardrobe[: 2 * _QUICK_GARMENTS]) | energy_gap(task)
+    result = with_displacement(bundle, out, metrics=metrics)
+    result.save(Path(out) / f"{bundle.category}.safetensors")
+    return result
+
+
+def with_displacement(
+    bundle: GarmentBundle, folder: Path, *, metrics: Mapping[str, float] | None = None
+) -> GarmentBundle:
+    """The bundle with the displacement network of a training's checkpoint, finished or not."""
+    weights, manifest = read_checkpoint(Path(folder) / CHECKPOINT)
+    network = DrapeField(DrapeFieldConfig.from_dict(manifest["config"]["field"]))
+    network.load_state_dict(weights)
+    notes = {key: manifest[key] for key in ("step", "seconds", "seed", "config")}
+    return replace(
+        bundle,
+        drape_field=network.eval().requires_grad_(False),
+        provenance={**bundle.provenance, "drape": notes},
+        metrics={**bundle.metrics, "drape": dict(metrics or manifest["metrics"])},
+    )

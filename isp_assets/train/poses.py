@@ -1,0 +1,107 @@
+"""Body poses to train on: frames of motions, blended, disturbed, and sometimes with limbs thrown about.
+
+Captured motion holds few arms along the torso and few wide steps, and a network
+trained on it alone fails there, so a share of the poses gets large random turns of
+shoulders, elbows, hips and knees.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.conventions import JOINT_NAMES, NUM_JOINTS
+from isp_assets.errors import TrainError
+from isp_assets.geometry.rotations import slerp
+from isp_assets.motion import Motion, builtin_motions
+
+_NOISE = 0.05  # of every joint [rad]
+_LARGEST_BLEND = 0.5
+_SCRAMBLED_SHARE = 0.3
+_SPREAD = {
+    "pelvis": (0.2, 0.0, 0.2), "spine1": (0.12, 0.12, 0.08), "spine2": (0.08, 0.08, 0.06),
+    "spine3": (0.08, 0.08, 0.06), "neck": (0.15, 0.15, 0.1),
+    "left_collar": (0.05, 0.08, 0.12), "right_collar": (0.05, 0.08, 0.12),
+    "left_shoulder": (0.4, 0.45, 0.5), "right_shoulder": (0.4, 0.45, 0.5),
+    "left_elbow": (0.2, 0.5, 0.2), "right_elbow": (0.2, 0.5, 0.2),
+    "left_wrist": (0.4, 0.3, 0.4), "right_wrist": (0.4, 0.3, 0.4),
+    "left_hip": (0.35, 0.15, 0.2), "right_hip": (0.35, 0.15, 0.2),
+    "left_knee": (0.35, 0.05, 0.05), "right_knee": (0.35, 0.05, 0.05),
+}  # fmt: skip
+"""Standard deviation of a thrown-about joint's added turn about its axes [rad]."""
+
+
+@dataclass(frozen=True)
+class PoseSource:
+    """Which motions to learn from, and which to keep for the test."""
+
+    folder: Path | None = None
+    """Further motions: every ``.npz`` of this folder."""
+    held_out: tuple[str, ...] = ()
+    """Names of motions that are kept for the test as a whole."""
+    held_tails: dict[str, float] = field(default_factory=lambda: {"walk": 0.33})
+    """Share at the end of a motion that is kept for the test."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clips:
+    """Frames to train on and frames to test on, by motion."""
+
+    train: dict[str, Float[np.ndarray, "_ 24 3"]]
+    test: dict[str, Float[np.ndarray, "_ 24 3"]]
+
+
+def load_clips(source: PoseSource) -> Clips:
+    """Read the built-in motions and those of a folder.
+
+    Raises:
+        MotionError: If a file is no motion.
+        TrainError: If a motion named as held out does not exist, or nothing is left to train on.
+    """
+    motions = [Motion.load(name) for name in builtin_motions()]
+    if source.folder is not None:
+        motions += [Motion.load(path) for path in sorted(Path(source.folder).glob("*.npz"))]
+    names = {motion.name for motion in motions}
+    if missing := set(source.held_out) - names:
+        raise TrainError(f"held-out motions {sorted(missing)} do not exist; there are {sorted(names)}")
+    clips = Clips({}, {})
+    for motion in motions:
+        if motion.name in source.held_out:
+            clips.test[motion.name] = motion.poses
+            continue
+        cut = round(len(motion) * (1 - source.held_tails.get(motion.name, 0.0)))
+        clips.train[motion.name] = motion.poses[:cut]
+        if cut < len(motion):
+            clips.test[motion.name] = motion.poses[cut:]
+    if not clips.train:
+        raise TrainError("every motion is held out; leave some to train on")
+    return clips
+
+
+def draw_poses(
+    clips: Sequence[Float[np.ndarray, "_ 24 3"]], count: int, generator: torch.Generator
+) -> Float[Tensor, "count 24 3"]:
+    """Random poses [rad]; every motion is as likely as any other, however long."""
+    first, second = _frames(clips, count, generator), _frames(clips, count, generator)
+    blend = _LARGEST_BLEND * torch.rand(count, 1, generator=generator)
+    second[:, 0] = first[:, 0]  # a blend of two headings would lean the body
+    poses = slerp(first, second, blend.expand(-1, NUM_JOINTS))
+    poses = poses + _NOISE * torch.randn(poses.shape, generator=generator)
+    spread = torch.zeros(NUM_JOINTS, 3)
+    for name, sizes in _SPREAD.items():
+        spread[JOINT_NAMES.index(name)] = torch.tensor(sizes)
+    thrown = (torch.rand(count, 1, 1, generator=generator) < _SCRAMBLED_SHARE).float()
+    poses = poses + thrown * spread * torch.randn(poses.shape, generator=generator)
+    poses[:, -2:] = 0  # hands
+    return poses
+
+
+def _frames(clips: Sequence[np.ndarray], count: int, generator: torch.Generator) -> Tensor:
+    clip = torch.randint(len(clips), (count,), generator=generator)
+    place = torch.rand(count, generator=generator)
+    rows = [clips[int(c)][int(p * len(clips[int(c)]))] for c, p in zip(clip, place, strict=True)]
+    return torch.tensor(np.stack(rows), dtype=torch.float32)

@@ -1,0 +1,126 @@
+"""Garments to train draping on: decoded, bound and measured once."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from isp_assets.body import Body
+from isp_assets.bundle import GarmentBundle
+from isp_assets.displacement import anchor_ramp, panel_sampler
+from isp_assets.errors import DecodeError, GeometryError, TrainError
+from isp_assets.garment import Garment
+from isp_assets.geometry.energy import ClothRest, Fabric, cloth_rest
+from isp_assets.geometry.panel_map import PanelSampler
+from isp_assets.networks.skin_field import SkinField
+from isp_assets.skinning import BoundGarment, bind
+from isp_assets.train.drape_energy import face_strain
+
+_JITTER = 0.15  # of a code, per standard deviation over the category's codes
+_MAX_STRAIN = 0.5  # p99 at rest above which a decoded garment is not fit to learn from
+
+
+@dataclass(frozen=True, eq=False)
+class WornSample:
+    """One garment, ready for training and measuring."""
+
+    garment: Garment
+    code: Float[Tensor, " Z"]
+    bound: BoundGarment
+    sampler: PanelSampler
+    ramp: Float[Tensor, "V 1"]
+    """Factor on displacements; 0 where the body holds the garment."""
+    rest: ClothRest
+
+    def to(self, device: torch.device | str) -> "WornSample":
+        """A copy on another device."""
+        return WornSample(
+            self.garment,
+            self.code.to(device),
+            self.bound.to(device),
+            self.sampler.to(device),
+            self.ramp.to(device),
+            self.rest.to(device),
+        )
+
+
+@dataclass(frozen=True)
+class WardrobeOptions:
+    """How many garments, and how fine."""
+
+    garments: int = 60
+    """Training garments; named ones first, then jittered and mixed codes."""
+    resolution: int = 90
+    """Grid cells across a panel; 90 give edges of about 18 mm."""
+    map_size: int = 64
+
+
+def make_sample(
+    garment: Garment, bundle: GarmentBundle, body: Body, skin: SkinField, *, map_size: int, fabric: Fabric
+) -> WornSample:
+    """Bind a garment and prepare its energy.
+
+    Raises:
+        GeometryError: If the garment's panels are degenerate.
+    """
+    rest = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, fabric)
+    return WornSample(
+        garment=garment,
+        code=torch.as_tensor(garment.code, dtype=torch.float32),
+        bound=bind(garment, body, skin),
+        sampler=panel_sampler(garment, bundle.model, resolution=map_size),
+        ramp=torch.from_numpy(anchor_ramp(garment))[:, None],
+        rest=rest.to(dtype=torch.float32),
+    )
+
+
+def build_wardrobe(
+    bundle: GarmentBundle, body: Body, skin: SkinField, options: WardrobeOptions, *, seed: int = 0
+) -> list[WornSample]:
+    """Decode and bind garments of a bundle; codes that give no sound garment are passed over.
+
+    Raises:
+        TrainError: If fewer than half of the garments asked for can be made.
+    """
+    wardrobe: list[WornSample] = []
+    for name, code in _codes(bundle, 3 * options.garments, np.random.default_rng(seed)):
+        if len(wardrobe) == options.garments:
+            break
+        try:
+            garment = bundle.decode(code, resolution=options.resolution)
+            sample = make_sample(garment, bundle, body, skin, map_size=options.map_size, fabric=Fabric())
+        except (DecodeError, GeometryError):
+            continue
+        if _rest_strain(sample) < _MAX_STRAIN:
+            wardrobe.append(sample)
+    if 2 * len(wardrobe) < options.garments:
+        raise TrainError(
+            f"only {len(wardrobe)} of {options.garments} garments of {bundle.category!r} could be decoded soundly; "
+            "train its pattern networks and atlases longer"
+        )
+    return wardrobe
+
+
+def _rest_strain(sample: WornSample) -> float:
+    rest = torch.as_tensor(sample.garment.rest_vertices, dtype=torch.float32)[None]
+    return float(face_strain(rest, sample.rest).quantile(0.99))
+
+
+def _codes(
+    bundle: GarmentBundle, count: int, rng: np.random.Generator
+) -> Iterator[tuple[str, Float[np.ndarray, " Z"]]]:
+    """Trained codes in random order, then jittered ones and mixtures of two, in turn."""
+    names: Sequence[str] = list(bundle.codes)
+    codes = np.stack([bundle.codes[name] for name in names])
+    spread = codes.std(axis=0)
+    order = rng.permutation(len(names))
+    for index in order[:count]:
+        yield names[index], codes[index]
+    for _ in range(count):
+        first, second = codes[rng.integers(len(codes), size=2)]
+        yield "jittered", (first + _JITTER * spread * rng.normal(size=spread.shape)).astype(np.float32)
+        share = rng.uniform(0, 1)
+        yield "mixed", ((1 - share) * first + share * second).astype(np.float32)
