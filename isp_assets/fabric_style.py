@@ -59,11 +59,12 @@ class FabricStyle:
 
     @property
     def second_color(self) -> Color:
-        """``accent``, or else a colour that goes with the first one."""
+        """``accent``, or else a darker or lighter tone of the first colour."""
         if self.accent is not None:
             return self.accent
-        towards = 1.0 if self.kind == "denim" or _luminance(self.color) < 0.4 else 0.25
-        return tuple(c + 0.55 * (towards - c) for c in self.color)  # type: ignore[return-value]
+        if self.kind == "denim" or _luminance(self.color) < 0.25:
+            return tuple(c + 0.55 * (1 - c) for c in self.color)  # type: ignore[return-value]
+        return tuple(0.55 * c for c in self.color)  # type: ignore[return-value]
 
     @property
     def thread_color(self) -> Color:
@@ -104,7 +105,7 @@ def _checks(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Ima
 def _denim(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Image]:
     twill = _wave(x + y, repeat, pixel)
     warp = _streaks(x, 3, pixel)
-    return 1 + 0.10 * twill + 0.05 * warp, np.clip(0.07 + 0.07 * twill + 0.06 * warp, 0, 1)
+    return 1 + 0.10 * twill + 0.025 * warp, np.clip(0.07 + 0.07 * twill + 0.03 * warp, 0, 1)
 
 
 def _knit(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Image]:
