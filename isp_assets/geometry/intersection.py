@@ -1,0 +1,164 @@
+"""How much of a garment lies where it must not: inside the body, or inside an inner garment.
+
+Four figures for a pair: area fraction, number of crossing triangle pairs, deepest
+penetration, and the area fraction that no garment could avoid (the body itself
+leaves no room there). Areas come from quadrature points on the faces, refined where
+a face lies on both sides.
+
+Positions are in metres, in one shared space. NumPy, one frame at a time.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
+from isp_assets.geometry.crossing import crossing_pairs
+
+INNER_REACH = 0.02
+"""How far beneath an inner garment [m] a point still counts as inside it."""
+
+_SPLITS = 4  # a face on both sides is cut into this many strips, 16 small triangles
+_ROOM = 0.006  # clearance [m] that cloth needs over the body
+_NEAR = 0.015  # a point this near [m] to skin without room is excused
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """One garment against one surface."""
+
+    area_percent: float
+    """Share of the garment's area on the wrong side, where it could have been avoided [%]."""
+    unavoidable_percent: float
+    """Share on the wrong side at places where the body leaves no room for cloth [%]."""
+    crossing_pairs: int
+    """Pairs of triangles that cross, all places."""
+    deepest: float
+    """Largest depth of a quadrature point on the wrong side, avoidable places only [m]."""
+
+
+class Beneath:
+    """A surface in one frame that garments are measured against; prepared once, used for every layer."""
+
+    def __init__(
+        self, vertices: Float[np.ndarray, "V 3"], topology: SurfaceTopology, *, closed: bool
+    ) -> None:
+        """Place a surface.
+
+        Args:
+            vertices: Its positions [m].
+            topology: Its connectivity.
+            closed: True for a body: inside is where the winding number exceeds one half.
+                False for a garment: inside is beneath its nearest triangle, at most ``INNER_REACH``.
+        """
+        if closed and topology.border_vertex.any():
+            raise GeometryError(
+                "a closed surface was expected, but the mesh has a border; is the body mesh complete?"
+            )
+        self.vertices = np.ascontiguousarray(vertices, np.float64)
+        self.topology = topology
+        self.closed = closed
+
+    @cached_property
+    def closest(self) -> ClosestQuery:
+        return ClosestQuery(self.vertices, self.topology)
+
+    @cached_property
+    def _winding(self) -> igl.FastWindingNumberBVH:
+        tree = igl.FastWindingNumberBVH()
+        tree.init(self.vertices, self.topology.faces)
+        return tree
+
+    @cached_property
+    def without_room(self) -> Bool[np.ndarray, " V"]:
+        """Vertices of a body above which cloth finds no room: creases, and parts that press together."""
+        if not self.closed:
+            return np.zeros(len(self.vertices), bool)
+        normals = igl.per_vertex_normals(self.vertices, self.topology.faces)
+        return self._winding.winding_number(self.vertices + _ROOM * normals).reshape(-1) > 0.5
+
+    def depth(
+        self, points: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
+        """Depth [m] of points on the wrong side, 0 elsewhere; and whether the body leaves no room there."""
+        found = self.closest(points)
+        distance = np.abs(found.height)
+        if self.closed:
+            # The nearest triangle misleads only where the body cuts itself: ask the winding number there.
+            inside = found.height < 0
+            cramped = self.without_room[self.topology.faces[found.face]].any(1)
+            if cramped.any():
+                inside[cramped] = self._winding.winding_number(points[cramped]).reshape(-1) > 0.5
+            excused = cramped & (distance < _NEAR)
+        else:
+            inside = (found.height < 0) & ~found.on_border & (distance < INNER_REACH)
+            excused = np.zeros(len(points), bool)
+        return np.where(inside, distance, 0.0), excused
+
+    def box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """Bounds of the points that may lie inside [m]."""
+        grow = 0.0 if self.closed else INNER_REACH
+        return self.vertices.min(0) - grow, self.vertices.max(0) + grow
+
+
+def measure_intersection(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], beneath: Beneath
+) -> Intersection:
+    """Measure one garment against one surface.
+
+    Raises:
+        GeometryError: If a position is not finite.
+    """
+    vertices = np.ascontiguousarray(vertices, np.float64)
+    if not np.isfinite(vertices).all():
+        raise GeometryError("garment positions hold NaN or infinity; nothing can be measured")
+    corner = vertices[faces]
+    areas = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    low, high = beneath.box()
+    near = np.flatnonzero(((corner.max(1) >= low) & (corner.min(1) <= high)).all(1))
+    wrong, excused, deepest = _wrong_shares(vertices, faces[near], beneath)
+    total = max(areas.sum(), 1e-30)
+    pairs = crossing_pairs(vertices, faces, beneath.vertices, beneath.topology.faces)
+    return Intersection(
+        area_percent=float(100 * (areas[near] * (wrong - excused)).sum() / total),
+        unavoidable_percent=float(100 * (areas[near] * excused).sum() / total),
+        crossing_pairs=len(pairs),
+        deepest=deepest,
+    )
+
+
+def _wrong_shares(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], beneath: Beneath
+) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"], float]:
+    """Share of each face on the wrong side, the excused part of it, and the deepest sample not excused."""
+    if len(faces) == 0:
+        return np.zeros(0), np.zeros(0), 0.0
+    used, index = np.unique(faces, return_inverse=True)
+    samples = np.concatenate([vertices[used], vertices[faces].mean(1)])
+    depth, excuse = beneath.depth(samples)
+    of_face = np.concatenate([index.reshape(-1, 3), len(used) + np.arange(len(faces))[:, None]], axis=1)
+    inside = depth[of_face] > 0
+    wrong = inside.mean(1)
+    excused = (inside & excuse[of_face]).mean(1)
+    deepest = float(np.where(excuse, 0, depth).max())
+    mixed = np.flatnonzero(inside.any(1) & ~inside.all(1))
+    if len(mixed):
+        weights = _subdivision(_SPLITS)
+        fine = np.einsum("qk,fkc->fqc", weights, vertices[faces[mixed]])
+        depth, excuse = (part.reshape(len(mixed), -1) for part in beneath.depth(fine.reshape(-1, 3)))
+        wrong[mixed] = (depth > 0).mean(1)
+        excused[mixed] = ((depth > 0) & excuse).mean(1)
+        deepest = max(deepest, float(np.where(excuse, 0, depth).max()))
+    return wrong, excused, deepest
+
+
+def _subdivision(splits: int) -> Float[np.ndarray, "Q 3"]:
+    """Barycentric centroids of the ``splits ** 2`` equal triangles a face is cut into."""
+    upward = [(i + 1 / 3, j + 1 / 3) for i in range(splits) for j in range(splits - i)]
+    downward = [(i + 2 / 3, j + 2 / 3) for i in range(splits - 1) for j in range(splits - 1 - i)]
+    first, second = np.array(upward + downward).T / splits
+    return np.stack([1 - first - second, first, second], axis=1)
