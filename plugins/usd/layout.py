@@ -20,10 +20,10 @@ import isp_assets
 from isp_assets.conventions import METRES_PER_UNIT, PANELS, UP_AXIS
 from isp_assets.fabric_style import Color
 from isp_assets.frames import Layer, Scene
+from isp_assets_plugins.normals import VertexNormals
 
 from .material import define_material, linear_color
 from .names import prim_names
-from .normals import VertexNormals
 
 BODY_COLOR: Color = (0.62, 0.60, 0.58)
 PANEL_FAMILY = "panel"

@@ -13,10 +13,10 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdShade
 from isp_assets.errors import PluginError
 from isp_assets.plugin_conformance import check_writer, write_shot
 from isp_assets.synthetic import SyntheticShot, synthetic_shot
+from isp_assets_plugins.normals import VertexNormals
 from isp_assets_plugins.usd import UsdWriter, check_usd
 from isp_assets_plugins.usd.material import linear_color
 from isp_assets_plugins.usd.names import prim_names
-from isp_assets_plugins.usd.normals import VertexNormals
 from isp_assets_plugins.usd.writer import FLUSH_EVERY
 
 
