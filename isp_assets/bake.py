@@ -225,7 +225,8 @@ def _near(border: _Border, pixel: float, shape: tuple[int, ...]) -> _Near:
         distance[box][closer] = squared[closer]
         along[box][closer] = np.float32(before) + share[closer] * np.float32(length)
         kind[box][closer] = what
-    pixels = np.nonzero(np.isfinite(distance))
+    rows, columns = np.nonzero(np.isfinite(distance))
+    pixels = rows, columns
     return _Near(pixels, pixel * np.sqrt(distance[pixels]), along[pixels], kind[pixels])
 
 

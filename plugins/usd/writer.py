@@ -36,6 +36,7 @@ class UsdWriter:
     version = "usd-core " + ".".join(str(v) for v in Usd.GetVersion()[1:])
 
     def __init__(self) -> None:
+        self._path = Path()
         self._work: Path | None = None
         self._stage: Usd.Stage | None = None
 
@@ -124,8 +125,8 @@ class UsdWriter:
         for file in sorted((work / self._textures).iterdir()):
             os.replace(file, target / file.name)
         layer = work / self._path.name
-        with layer.open("rb") as file:
-            os.fsync(file.fileno())
+        with layer.open("rb") as written:
+            os.fsync(written.fileno())
         os.replace(layer, self._path)
 
     def _check(self, chunk: FrameChunk) -> None:
