@@ -179,8 +179,10 @@ def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) ->
     return total / torch.bincount(index, minlength=sewn.num_vertices)[:, None]
 
 
-def _follow_border(network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"]):
-    """``x - grad s (s(x, z) - s(x, z0)) / |grad s|^2`` on the border: zero at ``z0``, with the slope of Eq. 5."""
+def _follow_border(
+    network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"]
+):
+    """Add ``-grad s (s(x, z) - s(x, z0)) / |grad s|^2`` on the border: 0 at ``z0``, sloped as in Eq. 5."""
     border = torch.from_numpy(np.flatnonzero(panel.border_label))
     points = xy[border].detach().requires_grad_()
     with torch.enable_grad():
@@ -203,7 +205,9 @@ def _check(model: GarmentModel, code: Float[np.ndarray, " Z"], resolution: int) 
     return code
 
 
-def _garment(model: GarmentModel, sewn: SewnPanels, code: Float[np.ndarray, " Z"], rest, name: str) -> Garment:
+def _garment(
+    model: GarmentModel, sewn: SewnPanels, code: Float[np.ndarray, " Z"], rest, name: str
+) -> Garment:
     anchors = [
         panel.vertex_index[points]
         for panel in sewn.panels.values()

@@ -20,7 +20,9 @@ class PolygonField(PanelField):
     ``sharpness`` is the slope of the label logits with distance; ``noise`` is added to them.
     """
 
-    def __init__(self, loops: Sequence[Edges], num_labels: int, *, sharpness: float = 200.0, noise=None) -> None:
+    def __init__(
+        self, loops: Sequence[Edges], num_labels: int, *, sharpness: float = 200.0, noise=None
+    ) -> None:
         nn.Module.__init__(self)
         self.config = PanelFieldConfig(num_labels=num_labels, code_size=CODE_SIZE)
         curves = [(label, np.asarray(points, float)) for loop in loops for label, points in loop]
@@ -94,18 +96,30 @@ def pillow_model(fields: Mapping[str, PanelField], seam_pairs, anchor_labels=())
     )
 
 
-def polygon_model(front: Sequence[Edges], back: Sequence[Edges], seam_pairs, anchor_labels=(), **options) -> GarmentModel:
+def polygon_model(
+    front: Sequence[Edges], back: Sequence[Edges], seam_pairs, anchor_labels=(), **options
+) -> GarmentModel:
     """A model whose panels are polygons."""
     labels = max(label for loop in (*front, *back) for label, _ in loop)
     fields = {"front": PolygonField(front, labels, **options), "back": PolygonField(back, labels, **options)}
     return pillow_model(fields, seam_pairs, anchor_labels)
 
 
-SKIRT = [(1, [(-0.6, -0.7), (0.6, -0.7)]), (2, [(0.6, -0.7), (0.3, 0.6)]), (3, [(0.3, 0.6), (-0.3, 0.6)]), (4, [(-0.3, 0.6), (-0.6, -0.7)])]
+SKIRT = [
+    (1, [(-0.6, -0.7), (0.6, -0.7)]),
+    (2, [(0.6, -0.7), (0.3, 0.6)]),
+    (3, [(0.3, 0.6), (-0.3, 0.6)]),
+    (4, [(-0.3, 0.6), (-0.6, -0.7)]),
+]
 """Hem, left side, waist, right side."""
 SKIRT_SEAMS = ((2, 2), (4, 4))
 
-_LEFT = [(2, [(0.35, -0.7), (0.35, 0.1)]), (3, [(0.35, 0.1), (0.8, 0.1)]), (4, [(0.8, 0.1), (0.8, 0.4)]), (5, [(0.8, 0.4), (0.15, 0.5)])]
+_LEFT = [
+    (2, [(0.35, -0.7), (0.35, 0.1)]),
+    (3, [(0.35, 0.1), (0.8, 0.1)]),
+    (4, [(0.8, 0.1), (0.8, 0.4)]),
+    (5, [(0.8, 0.4), (0.15, 0.5)]),
+]
 _MIRROR = {2: 9, 3: 8, 4: 7, 5: 6}
 
 
@@ -113,9 +127,19 @@ def _flip(edges: Edges, names: Mapping[int, int]) -> list:
     return [(names.get(label, label), [(-x, y) for x, y in points[::-1]]) for label, points in edges[::-1]]
 
 
-SHIRT = [(1, [(-0.35, -0.7), (0.35, -0.7)]), *_LEFT, (10, [(0.15, 0.5), (0.0, 0.4), (-0.15, 0.5)]), *_flip(_LEFT, _MIRROR)]
+SHIRT = [
+    (1, [(-0.35, -0.7), (0.35, -0.7)]),
+    *_LEFT,
+    (10, [(0.15, 0.5), (0.0, 0.4), (-0.15, 0.5)]),
+    *_flip(_LEFT, _MIRROR),
+]
 """Hem, side, under sleeve, cuff, over sleeve, neckline, and the other half."""
 SHIRT_SEAMS = ((2, 2), (3, 3), (5, 5), (6, 6), (8, 8), (9, 9))
-_LEFT_FRONT = [(1, [(0.02, -0.7), (0.35, -0.7)]), *_LEFT, (10, [(0.15, 0.5), (0.02, 0.42)]), (11, [(0.02, 0.42), (0.02, -0.7)])]
+_LEFT_FRONT = [
+    (1, [(0.02, -0.7), (0.35, -0.7)]),
+    *_LEFT,
+    (10, [(0.15, 0.5), (0.02, 0.42)]),
+    (11, [(0.02, 0.42), (0.02, -0.7)]),
+]
 JACKET_FRONT = [_LEFT_FRONT, _flip(_LEFT_FRONT, {**_MIRROR, 11: 12})]
 """Two pieces that part in the middle."""

@@ -20,7 +20,7 @@ _WINDOW = 0.035
 """How far from a label switch its corner is looked for."""
 _CHORD = 0.025
 """Length of the two chords that measure how much the outline turns."""
-_TURN = np.deg2rad(22.0)
+_TURN = np.deg2rad(40.0)
 """Turns smaller than this are no corner."""
 _CONFIDENT = 6.0
 """Log odds beyond this count alike: one sure point must not outvote its neighbours."""
@@ -32,7 +32,7 @@ class EdgeRun:
 
     label: int
     points: Float[np.ndarray, "n 2"]
-    """Polyline from corner to corner, counter-clockwise about the panel; the last point is the first of the next run."""
+    """From corner to corner, counter-clockwise about the panel; ends where the next run begins."""
 
     @property
     def length(self) -> float:
@@ -64,19 +64,19 @@ def split_edges(points: Float[np.ndarray, "n 2"], logits: Float[np.ndarray, "n L
     n = len(points)
     step = float(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).mean())
     evidence = _smooth(_log_probability(logits), round(_SMOOTHING / step))
-    starts, labels = _merge_short(evidence, max(2, round(_SHORT / step)))
+    starts, labels = (a.tolist() for a in _merge_short(evidence, max(2, round(_SHORT / step))))
     if len(starts) == 1:
-        return (EdgeRun(int(labels[0]) + 1, np.concatenate([points, points[:1]])),)
+        return (EdgeRun(labels[0] + 1, np.concatenate([points, points[:1]])),)
     turn = _turning(points, max(2, round(_CHORD / step)))
     lengths = np.diff(np.append(starts, starts[0] + n))
     corners = []
     for k, start in enumerate(starts):
         room = min(lengths[k - 1], lengths[k]) // 2 - 1
         window = int(min(max(room, 0), round(_WINDOW / step)))
-        switch = _switch_position(evidence, int(start), labels[k - 1], labels[k])
+        switch = _switch_position(evidence, start, labels[k - 1], labels[k])
         corners.append(_place_corner(points, turn, switch, window))
     return tuple(
-        EdgeRun(int(labels[k]) + 1, _between(points, corners[k], corners[(k + 1) % len(corners)]))
+        EdgeRun(labels[k] + 1, _between(points, corners[k], corners[(k + 1) % len(corners)]))
         for k in range(len(starts))
     )
 
@@ -129,7 +129,9 @@ def _merge_short(evidence: Float[np.ndarray, "n K"], shortest: int):
     if len(starts) == 0:
         return np.array([0]), best[:1]
     labels = best[starts]
-    total = np.concatenate([[np.zeros(evidence.shape[1])], np.cumsum(np.concatenate([evidence, evidence]), axis=0)])
+    total = np.concatenate(
+        [[np.zeros(evidence.shape[1])], np.cumsum(np.concatenate([evidence, evidence]), axis=0)]
+    )
     while len(starts) > 1:
         lengths = np.diff(np.append(starts, starts[0] + n))
         k = int(lengths.argmin())
@@ -161,7 +163,9 @@ def _switch_position(evidence: Float[np.ndarray, "n K"], start: int, old: int, n
     return start - 1 + float(difference[0] / (difference[0] - difference[1]))
 
 
-def _place_corner(points: Float[np.ndarray, "n 2"], turn: Float[np.ndarray, " n"], switch: float, window: int) -> _Corner:
+def _place_corner(
+    points: Float[np.ndarray, "n 2"], turn: Float[np.ndarray, " n"], switch: float, window: int
+) -> _Corner:
     """The sharpest point near a label switch, or the switch itself on a smooth stretch."""
     n = len(points)
     around = round(switch) + np.arange(-window, window + 1)
@@ -173,7 +177,7 @@ def _place_corner(points: Float[np.ndarray, "n 2"], turn: Float[np.ndarray, " n"
         position = (1 - share) * points[last % n] + share * points[(last + 1) % n]
         # A point nearer than half a step to the corner would make a needle of an edge.
         return _Corner(position, last - (share < 0.5), last + 1 + (share >= 0.5))
-    sharp = _meet(points[(center + np.arange(-6, -1)) % n], points[(center + np.arange(6, 1, -1)) % n])
+    sharp = _meet(points[(center + np.arange(-4, -1)) % n], points[(center + np.arange(4, 1, -1)) % n])
     step = np.linalg.norm(points[(center + 1) % n] - points[center % n])
     if sharp is None or np.linalg.norm(sharp - points[center % n]) > 1.5 * step:
         return _Corner(points[center % n], center - 1, center + 1)
@@ -183,7 +187,10 @@ def _place_corner(points: Float[np.ndarray, "n 2"], turn: Float[np.ndarray, " n"
 def _meet(before: Float[np.ndarray, "m 2"], after: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "2"] | None:
     """Where the lines through two short stretches cross; None if they are nearly parallel."""
     origins = np.stack([before.mean(axis=0), after.mean(axis=0)])
-    lines = [np.linalg.svd(stretch - origin)[2][0] for stretch, origin in zip((before, after), origins, strict=True)]
+    lines = [
+        np.linalg.svd(stretch - origin)[2][0]
+        for stretch, origin in zip((before, after), origins, strict=True)
+    ]
     cross = lines[0][0] * lines[1][1] - lines[0][1] * lines[1][0]
     if abs(cross) < 0.3:
         return None

@@ -46,9 +46,9 @@ class PlaneField:
 class Outline:
     """The border of one panel, as closed polygons with their label logits."""
 
-    loops: tuple[Float[np.ndarray, "n 2"], ...]
+    loops: tuple[Float[np.ndarray, "_ 2"], ...]
     """One a piece, counter-clockwise, evenly spaced, from left to right; no repeated end point."""
-    logits: tuple[Float[np.ndarray, "n L"], ...]
+    logits: tuple[Float[np.ndarray, "_ L"], ...]
     """Logits of the edge labels at every point of the loops."""
     num_specks: int
     """Tiny pieces and holes that were dropped."""
@@ -140,14 +140,16 @@ def _double(values: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
     return values
 
 
-def _zero_loops(values: Float[np.ndarray, "n n"]) -> tuple[list[Float[np.ndarray, "n 2"]], int]:
+def _zero_loops(values: Float[np.ndarray, "n n"]) -> tuple[list[Float[np.ndarray, "_ 2"]], int]:
     """Closed zero contours of a grid, counter-clockwise, and the number of specks left out."""
     if not np.isfinite(values).all():
         raise GeometryError("the panel field gives NaN or infinity")
     axis = np.linspace(-1.0, 1.0, len(values))
     lines = contour_generator(axis, axis, values).lines(0.0)
     if not lines:
-        raise GeometryError("the panel field has no inside" if values[0, 0] > 0 else "the panel covers its whole square")
+        raise GeometryError(
+            "the panel field has no inside" if values[0, 0] > 0 else "the panel covers its whole square"
+        )
     if any((line[0] != line[-1]).any() for line in lines):
         raise GeometryError("the panel reaches the edge of its square [-1, 1]^2")
     loops = [line[:0:-1] for line in lines]  # contourpy keeps the higher side to the left
@@ -171,7 +173,7 @@ def _length(loop: Float[np.ndarray, "n 2"]) -> float:
 
 
 def _project(field: PlaneField, points: Float[np.ndarray, "n 2"], limit: float):
-    """One Newton step ``x - s grad s / |grad s|^2`` to the zero level, no longer than ``limit``; and the logits."""
+    """One Newton step ``x - s grad s / |grad s|^2``, no longer than ``limit``; and the logits."""
     distance, gradient, logits = field.border(points)
     slope = (gradient**2).sum(axis=1)
     move = (distance / np.maximum(slope, _FLAT_SLOPE))[:, None] * gradient

@@ -36,7 +36,7 @@ class FlatPanel:
     """Sewn vertex of every point."""
     border_label: Int[np.ndarray, " P"]
     """Label of the edge that starts at or passes through a border point, 0 inside."""
-    runs: tuple[tuple[int, Int[np.ndarray, " n"]], ...]
+    runs: tuple[tuple[int, Int[np.ndarray, " _"]], ...]
     """Label and points of every edge, both corners included."""
 
 
@@ -104,12 +104,16 @@ def sew_panels(
     total = offset + len(panels["back"].points)
     vertex, count = weld(total, np.concatenate([*pairs, np.empty((0, 2), dtype=np.int64)]))
     index = {"front": vertex[:offset], "back": vertex[offset:]}
-    sewn = SewnPanels({side: replace(panels[side], vertex_index=index[side]) for side in PANELS}, seams, count)
+    sewn = SewnPanels(
+        {side: replace(panels[side], vertex_index=index[side]) for side in PANELS}, seams, count
+    )
     _check_surface(sewn.faces)
     return sewn
 
 
-def _match(loops: dict[str, list[Loop]], seam_pairs: Sequence[tuple[int, int]], sliver: float) -> list[_Match]:
+def _match(
+    loops: dict[str, list[Loop]], seam_pairs: Sequence[tuple[int, int]], sliver: float
+) -> list[_Match]:
     """Pair the runs of every seam; dissolves slivers in ``loops``, in place."""
     while True:
         matches, spare = [], []
@@ -147,7 +151,9 @@ def _pair(loops: Mapping[str, list[Loop]], places: Sequence[list[tuple[int, int]
     return [(places[0][a], places[1][b]) for a, b in zip(rows, columns, strict=True)], left
 
 
-def _counts(loops: Mapping[str, list[Loop]], matches: Sequence[_Match], spacing: float) -> dict[str, list[list[int]]]:
+def _counts(
+    loops: Mapping[str, list[Loop]], matches: Sequence[_Match], spacing: float
+) -> dict[str, list[list[int]]]:
     """Number of edges of every run."""
 
     def edges_of(length: float, run: EdgeRun) -> int:
@@ -157,8 +163,12 @@ def _counts(loops: Mapping[str, list[Loop]], matches: Sequence[_Match], spacing:
     counts = {side: [[edges_of(run.length, run) for run in loop] for loop in loops[side]] for side in PANELS}
     for match in matches:
         runs = [loops[side][i][k] for side, (i, k) in zip(PANELS, (match.front, match.back), strict=True)]
-        if any(len(loops[side][p[0]]) == 1 for side, p in zip(PANELS, (match.front, match.back), strict=True)):
-            raise GeometryError(f"seam {match.labels}: a whole outline is sewn, which leaves no corner to begin at")
+        if any(
+            len(loops[side][p[0]]) == 1 for side, p in zip(PANELS, (match.front, match.back), strict=True)
+        ):
+            raise GeometryError(
+                f"seam {match.labels}: a whole outline is sewn, which leaves no corner to begin at"
+            )
         count = edges_of(0.5 * (runs[0].length + runs[1].length), runs[0])
         for side, (i, k) in zip(PANELS, (match.front, match.back), strict=True):
             counts[side][i][k] = count
@@ -244,4 +254,6 @@ def _check_surface(faces: Int[np.ndarray, "F 3"]) -> None:
         raise GeometryError("sewing folds a triangle onto one edge; two seams meet twice")
     count = edges(faces).num_faces
     if (count > 2).any():
-        raise GeometryError(f"the sewn panels are no surface: {int((count > 2).sum())} edges have more than two faces")
+        raise GeometryError(
+            f"the sewn panels are no surface: {int((count > 2).sum())} edges have more than two faces"
+        )
