@@ -81,16 +81,16 @@ def drape(
     from dataclasses import replace
 
     from isp_assets.drape import DrapeOptions
-    from isp_assets.pipeline import run_job, writer_names
+    from isp_assets.pipeline import run_job, split_names
     from isp_assets.shot import ShotJob
 
     with out_console.status("loading"):
         job = ShotJob.load(shot, frames=FrameRange.parse(frames) if frames else None)
     if write is not None:
-        job = replace(job, write=writer_names(write))
+        job = replace(job, write=split_names(write))
     options = DrapeOptions(device=_device(device))
     if steps is not None:
-        options = replace(options, steps=writer_names(steps))
+        options = replace(options, steps=split_names(steps))
     with _progress() as (bar, task):
         report = run_job(
             job,

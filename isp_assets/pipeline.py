@@ -9,7 +9,7 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -205,6 +205,6 @@ def _peak_memory_mib() -> float:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
-def writer_names(text: str) -> Sequence[str]:
+def split_names(text: str) -> tuple[str, ...]:
     """Split ``"usd,glb"``; empty parts are dropped, order is kept, doubles are merged."""
     return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))

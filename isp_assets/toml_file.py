@@ -30,7 +30,7 @@ def read_toml(path: Path, error: type[InputError]) -> dict[str, Any]:
 
 def check_keys(
     table: Mapping[str, Any],
-    expected: Mapping[str, type | tuple[type, ...]],
+    expected: Mapping[str, Any],
     required: set[str],
     where: str,
     error: type[InputError],
