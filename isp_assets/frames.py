@@ -62,7 +62,7 @@ class FrameChunk:
     steps: tuple[tuple[tuple[str, ...], ...], ...] = ()
     """Names of the steps that ran, per frame and layer."""
     metrics: tuple[dict[str, float], ...] = ()
-    """Per frame: measured figures such as ``body/L01_trousers/area_percent``."""
+    """Per frame: measured figures such as ``final/L01_trousers/body_area_percent``."""
 
 
 @dataclass(frozen=True, eq=False)
