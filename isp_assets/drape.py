@@ -161,14 +161,17 @@ class _Draper:
             _note(ran, "layering", touched)
         state.keep("layering", vertices, keep)
         result = vertices.cpu().numpy()
+        tight: list[np.ndarray] | None = None
         if "project" in steps:
             with state.timed("project"):
-                result = self._project(worn, result, state, ran)
+                result, tight = self._project(worn, result, state, ran)
         state.steps.append(ran)
         outside = torch.as_tensor(result, device=vertices.device)
         state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
-        for obstacles, positions in zip(state.obstacles, result, strict=True):
-            obstacles.append(Obstacle(worn.collision, positions, margin=self.options.layer_margin))
+        for t, obstacles in enumerate(state.obstacles):
+            found = tight[t] if tight is not None else None
+            margin = self.options.layer_margin
+            obstacles.append(Obstacle(worn.collision, result[t], margin=margin, tight=found))
         return result
 
     def _project(
@@ -177,16 +180,18 @@ class _Draper:
         vertices: Float[np.ndarray, "T V 3"],
         state: "_ChunkState",
         ran: list[list[str]],
-    ) -> Float[np.ndarray, "T V 3"]:
-        result = np.empty_like(vertices)
+    ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray]]:
+        """Projected vertices, and per frame which of them have no room."""
+        result, tight = np.empty_like(vertices), []
         for t, obstacles in enumerate(state.obstacles):
             if not np.isfinite(vertices[t]).all():
                 raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
             done = project(vertices[t], worn.collision, obstacles, self.options.projection)
             result[t] = done.vertices
+            tight.append(done.tight)
             if done.ran:
                 ran[t].append("project")
-        return result
+        return result, tight
 
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
         for worn, positions in zip(self.worn, layers, strict=True):
