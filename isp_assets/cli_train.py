@@ -18,6 +18,7 @@ MinutesOption = Annotated[float | None, typer.Option("--minutes", help="Training
 StepsOption = Annotated[int | None, typer.Option("--steps", help="Number of steps; or give --minutes.")]
 SeedOption = Annotated[int, typer.Option("--seed")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")]
+BodyOption = Annotated[str, typer.Option("--body", help='"default" or an SMPL .npz or .pkl file.')]
 DeviceOption = Annotated[str, typer.Option("--device", help="cpu or cuda.")]
 
 
@@ -72,6 +73,58 @@ def patterns(
 
     run = _run(minutes, steps, seed, resume, device)
     train_patterns(load_dataset(data, category), out, run=run, options=PatternOptions(width=width))
+
+
+@train_app.command("skin")
+def skin(
+    out: OutOption,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    resume: ResumeOption = False,
+    device: DeviceOption = "cpu",
+    body: BodyOption = "default",
+) -> None:
+    """Train the diffused skinning of a body: skin.safetensors (Eqs. 6-7)."""
+    from isp_assets.body import Body
+    from isp_assets.train.skin import rest_poses_of_categories, train_skin
+
+    run = _run(minutes, steps, seed, resume, device)
+    train_skin(out, run, body=Body.load(body), rest_poses=rest_poses_of_categories())
+
+
+@train_app.command("drape")
+def drape(
+    bundle: Annotated[Path, typer.Option("--bundle", help="Garment bundle of the category.")],
+    skin: Annotated[Path, typer.Option("--skin", help="Skin bundle of the body.")],
+    out: OutOption,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    resume: ResumeOption = False,
+    device: DeviceOption = "cpu",
+    body: BodyOption = "default",
+    motions: Annotated[
+        Path | None, typer.Option(help="Folder of further motions (AMASS-style .npz).")
+    ] = None,
+    hold_out: Annotated[str, typer.Option(help="Motions kept for the test, separated by commas.")] = "",
+    garments: Annotated[int, typer.Option(help="Garments to learn from.")] = 60,
+) -> None:
+    """Train a category's displacements on physics alone: CATEGORY.safetensors (Eq. 8)."""
+    from isp_assets.body import Body
+    from isp_assets.bundle import GarmentBundle, SkinBundle
+    from isp_assets.train.displacement import DisplacementOptions, train_displacement
+    from isp_assets.train.poses import PoseSource
+    from isp_assets.train.wardrobe import WardrobeOptions
+
+    run = _run(minutes, steps, seed, resume, device)
+    held_out = tuple(name for name in hold_out.split(",") if name)
+    options = DisplacementOptions(
+        wardrobe=WardrobeOptions(garments=garments), poses=PoseSource(motions, held_out=held_out)
+    )
+    train_displacement(
+        GarmentBundle.load(bundle), SkinBundle.load(skin), out, run, body=Body.load(body), options=options
+    )
 
 
 def _run(minutes: float | None, steps: int | None, seed: int, resume: bool, device: str) -> "RunOptions":

@@ -55,7 +55,7 @@ def panel_sampler(garment: Garment, model: GarmentModel, *, resolution: int) -> 
 
 
 def anchor_ramp(garment: Garment, *, length: float = ANCHOR_RAMP) -> Float[np.ndarray, " V"]:
-    """0 at anchored vertices, rising smoothly to 1 at ``length`` [m] along the cloth; all 1 without anchors."""
+    """0 at anchored vertices, rising to 1 at ``length`` [m] along the cloth. All 1 without anchors."""
     if len(garment.anchors) == 0:
         return np.ones(garment.num_vertices, np.float32)
     start, end = edges(garment.faces).vertices.T
@@ -83,7 +83,8 @@ def bind_displacement(
     """
     if sampler.resolution != field.config.map_size:
         raise DrapeError(
-            f"the displacement network has maps of {field.config.map_size} texels, the sampler {sampler.resolution}"
+            f"the displacement network has maps of {field.config.map_size} texels, "
+            f"the sampler of {sampler.resolution}"
         )
     basis, mean = field.maps()
     scale = torch.as_tensor(ramp).to(mean)[:, None]

@@ -28,7 +28,7 @@ def drape_features(
 
     Args:
         posed: The body over T frames.
-        betas: Shape coefficients, ``[B]`` or ``[T, B]``; missing ones count as zero, further ones are left out.
+        betas: Shape coefficients, ``[B]`` or ``[T, B]``; missing ones count as zero.
         code: The garment's latent code.
         num_betas: Coefficients that the network was made for.
     """

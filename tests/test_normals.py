@@ -8,8 +8,8 @@ from isp_assets.geometry.rotations import axis_angle_to_matrix
 
 CUBE = torch.tensor([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 CUBE_FACES = torch.tensor(
-    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2],
-     [1, 3, 7], [1, 7, 5]]
+    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4],
+     [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5]]
 )  # fmt: skip
 
 
@@ -56,7 +56,8 @@ def test_degenerate_faces_and_lone_vertices_give_zero_and_finite_gradients() -> 
     normal = vertex_normals(v, torch.tensor([[0, 1, 2]]))
     normal.sum().backward()
     assert torch.equal(normal, torch.zeros(4, 3))
-    assert v.grad is not None and torch.isfinite(v.grad).all()
+    assert v.grad is not None
+    assert torch.isfinite(v.grad).all()
 
 
 def test_tiny_faces_keep_their_direction() -> None:

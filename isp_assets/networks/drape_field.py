@@ -21,7 +21,6 @@ from isp_assets.networks.mlp import Mlp
 
 POSE_FEATURES = 3 + 21 * 6
 """Gravity's direction, and six numbers for each of 21 joints."""
-_COARSE = 8  # texels of the finest detail that the maps start with
 
 
 @dataclass(frozen=True)
@@ -39,6 +38,8 @@ class DrapeFieldConfig:
     """Number K of fixed maps."""
     map_size: int = 64
     """Texels R along a side of a map."""
+    coarse_size: int = 16
+    """Texels of a coarse map that is enlarged and added to each, so that what is learnt spreads; 0 for none."""
     displacement_scale: float = 0.05
     """Factor on the maps [m]."""
     code_scale: float = 1.0
@@ -46,8 +47,8 @@ class DrapeFieldConfig:
 
     @classmethod
     def paper(cls) -> "DrapeFieldConfig":
-        """The size used by the paper: 8 layers of 512, and a linear layer to 200² texels (125 million weights)."""
-        return cls(depth=8, skip=4, activation="relu", basis=512, map_size=200)
+        """The size used by the paper: 8 layers of 512, then 200² texels (125 million weights)."""
+        return cls(depth=8, skip=4, activation="relu", basis=512, map_size=200, coarse_size=0)
 
     @property
     def num_features(self) -> int:
@@ -74,11 +75,16 @@ class DrapeField(nn.Module):
             parts, config.basis, width=config.width, depth=config.depth, skip=config.skip,
             activation=config.activation,
         )  # fmt: skip
-        # Smooth random maps: texels that no training garment covers keep what they start with.
-        coarse = torch.randn(config.basis, 6, max(2, size // _COARSE), max(2, size // _COARSE))
-        smooth = nn.functional.interpolate(coarse, size=(size, size), mode="bicubic", align_corners=False)
-        self.basis = nn.Parameter(smooth * config.basis**-0.5)
-        self.mean = nn.Parameter(torch.zeros(6, size, size))
+        # The last map is the mean. Texels that no training garment covers keep what they start with: smooth maps.
+        coarse = (
+            torch.randn(config.basis + 1, 6, *(config.coarse_size or size // 4,) * 2) * config.basis**-0.5
+        )
+        coarse[-1] = 0
+        if config.coarse_size:
+            self.coarse = nn.Parameter(coarse)
+            self.fine = nn.Parameter(torch.zeros(config.basis + 1, 6, size, size))
+        else:
+            self.fine = nn.Parameter(_enlarged(coarse, size))
         nn.init.zeros_(self.mlp.layers[-1].weight)
         nn.init.zeros_(self.mlp.layers[-1].bias)
 
@@ -94,9 +100,17 @@ class DrapeField(nn.Module):
 
     def maps(self) -> tuple[Float[Tensor, "K 6 R R"], Float[Tensor, "6 R R"]]:
         """The fixed maps and the mean map [m]; channels 0-2 are the front panel, 3-5 the back."""
-        return self.config.displacement_scale * self.basis, self.config.displacement_scale * self.mean
+        texels = self.fine
+        if self.config.coarse_size:
+            texels = texels + _enlarged(self.coarse, self.config.map_size)
+        texels = self.config.displacement_scale * texels
+        return texels[:-1], texels[-1]
 
     def forward(self, features: Float[Tensor, "T F"]) -> Float[Tensor, "T 6 R R"]:
         """Displacement maps of T frames [m]; arguments as in `coefficients`."""
         basis, mean = self.maps()
         return (self.coefficients(features) @ basis.flatten(1)).unflatten(1, mean.shape) + mean
+
+
+def _enlarged(maps: Float[Tensor, "K 6 r r"], size: int) -> Float[Tensor, "K 6 R R"]:
+    return nn.functional.interpolate(maps, size=(size, size), mode="bilinear", align_corners=False)

@@ -24,7 +24,7 @@ from isp_assets.displacement import displace
 from isp_assets.drape_features import drape_features
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface
-from isp_assets.geometry.energy import Fabric
+from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.skinning import shape_garment, skin_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, graded_rest, reference_energy
@@ -41,7 +41,7 @@ _QUICK_GARMENTS, _TEST_FRAMES = 3, 8
 class DisplacementOptions:
     """What D_s is trained on."""
 
-    field: DrapeFieldConfig = DrapeFieldConfig()
+    network: DrapeFieldConfig = DrapeFieldConfig()
     """Size; its code size and code scale are replaced by the bundle's."""
     wardrobe: WardrobeOptions = WardrobeOptions()
     poses: PoseSource = field(default_factory=PoseSource)
@@ -71,7 +71,7 @@ class DisplacementTask:
     ) -> None:  # fmt: skip
         codes = np.stack(list(bundle.codes.values()))
         config = replace(
-            options.field, code_size=codes.shape[1], code_scale=float(1 / max(codes.std(), 1e-6))
+            options.network, code_size=codes.shape[1], code_scale=float(1 / max(codes.std(), 1e-6))
         )
         torch.manual_seed(seed)
         self.name = f"drape {bundle.category}"
@@ -101,14 +101,14 @@ class DisplacementTask:
         poses = draw_poses(list(self.clips.train.values()), self.options.frames, generator)
         betas = _BETA_RANGE * (2 * torch.rand(self.module.config.num_betas, generator=generator) - 1)
         batch = self.pose(poses, betas)
-        basis, mean = self.module.maps()
+        maps = self.module.maps()
         chosen = torch.randint(len(self.wardrobe), (self.options.garments,), generator=generator)
         stiffness = self.options.contact.at(progress)
         totals: dict[str, Tensor] = {}
         for index in chosen.tolist():
             sample = self.wardrobe[index]
-            vertices = self.drape(sample, batch, maps=(basis, mean))
-            for name, value in self._scaled(sample, vertices, batch, stiffness).items():
+            skinned, vertices = self.drape(sample, batch, maps=maps)
+            for name, value in self._scaled(sample, skinned, vertices, batch, stiffness).items():
                 totals[name] = totals.get(name, 0.0) + value / len(chosen)
         return totals
 
@@ -120,20 +120,22 @@ class DisplacementTask:
             return PosedBatch(betas, posed, Surface.of_mesh(posed.vertices, self.body.faces))
 
     def drape(
-        self, sample: WornSample, batch: PosedBatch, *, maps: tuple[Tensor, Tensor] | None
-    ) -> Float[Tensor, "T V 3"]:
-        """Skin a garment and, given the network's maps, displace it; differentiable in the network."""
+        self, sample: WornSample, batch: PosedBatch, *, maps: tuple[Tensor, Tensor]
+    ) -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T V 3"]]:
+        """Skin a garment, then displace it by the network; differentiable in the network.
+
+        Returns:
+            Positions after skinning, and after displacing [m].
+        """
         with torch.no_grad():
-            vertices, linear = skin_garment(sample.bound, batch.posed, batch.betas)
-        if maps is None:
-            return vertices
+            skinned, linear = skin_garment(sample.bound, batch.posed, batch.betas)
         basis, mean = maps
         features = drape_features(
             batch.posed, batch.betas, sample.code, num_betas=self.module.config.num_betas
         )
         coefficients = self.module.coefficients(features)
         drawn = (coefficients @ basis.flatten(1)).unflatten(1, mean.shape) + mean
-        return displace(vertices, linear, sample.sampler.sample(drawn) * sample.ramp)
+        return skinned, displace(skinned, linear, sample.sampler.sample(drawn) * sample.ramp)
 
     def case(self, sample: WornSample, batch: PosedBatch) -> DrapeCase:
         """What measuring a garment in some poses needs besides its positions."""
@@ -142,7 +144,7 @@ class DisplacementTask:
         return DrapeCase(rest, self.fabric, batch.surface, self.options.contact)
 
     def _scaled(
-        self, sample: WornSample, vertices: Tensor, batch: PosedBatch, stiffness: float
+        self, sample: WornSample, skinned: Tensor, vertices: Tensor, batch: PosedBatch, stiffness: float
     ) -> dict[str, Tensor]:
         case = self.case(sample, batch)
         terms = drape_energies(
@@ -152,7 +154,7 @@ class DisplacementTask:
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")
         # The gradient is that of the energy's square root where the energy is large.
         weight = (reference * (reference + present)).rsqrt()
-        terms["gravity"] = terms["gravity"] - terms["gravity"].detach()  # its level means nothing
+        terms["gravity"] = terms["gravity"] - gravity_energy(skinned, case.rest)
         return {name: (weight * value).mean() for name, value in terms.items()}
 
     @torch.no_grad()
@@ -168,8 +170,9 @@ class DisplacementTask:
             batch = self.pose(poses, betas)
             for sample in samples:
                 case = self.case(sample, batch)
-                row = measure_drape(case, self.drape(sample, batch, maps=None), prefix="skin.")
-                rows.append(row | measure_drape(case, self.drape(sample, batch, maps=maps), prefix=""))
+                skinned, vertices = self.drape(sample, batch, maps=maps)
+                row = measure_drape(case, skinned, prefix="skin.")
+                rows.append(row | measure_drape(case, vertices, prefix=""))
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def test_batches(self) -> list[tuple[Float[Tensor, "T 24 3"], Float[Tensor, " B"]]]:

@@ -42,9 +42,7 @@ class Contact:
         return self.first_stiffness * (self.stiffness / self.first_stiffness) ** min(1.25 * progress, 1.0)
 
 
-def graded_rest(
-    rest: ClothRest, canonical: Float[Tensor, "V 3"], shaped: Float[Tensor, "V 3"]
-) -> ClothRest:
+def graded_rest(rest: ClothRest, canonical: Float[Tensor, "V 3"], shaped: Float[Tensor, "V 3"]) -> ClothRest:
     """The pattern graded from the mean body to another.
 
     Args:
@@ -60,9 +58,7 @@ def graded_rest(
     # The panel lies in that frame turned by the rotation of the map panel -> garment.
     turn = _rotation(start @ rest.inverse_rest)
     graded = turn.transpose(-1, -2) @ stretch @ turn @ torch.linalg.inv(rest.inverse_rest)
-    return replace(
-        rest, inverse_rest=torch.linalg.inv(graded), area=0.5 * torch.linalg.det(graded).abs()
-    )
+    return replace(rest, inverse_rest=torch.linalg.inv(graded), area=0.5 * torch.linalg.det(graded).abs())
 
 
 def drape_energies(
@@ -75,7 +71,9 @@ def drape_energies(
         "strain": membrane_energy(vertices, rest, fabric),
         "bending": bending_energy(vertices, rest, fabric),
         "gravity": gravity_energy(vertices, rest),
-        "collision": (contact.cubic * lacking.pow(3) + 0.5 * stiffness * rest.mass * lacking.square()).sum(-1),
+        "collision": (contact.cubic * lacking.pow(3) + 0.5 * stiffness * rest.mass * lacking.square()).sum(
+            -1
+        ),
     }
 
 
@@ -88,7 +86,10 @@ def face_strain(vertices: Float[Tensor, "T V 3"], rest: ClothRest) -> Float[Tens
     """Largest relative change of length in each face."""
     deformation = _flat_edges(vertices[:, rest.faces]) @ rest.inverse_rest
     metric = deformation.transpose(-1, -2) @ deformation
-    middle, half = 0.5 * (metric[..., 0, 0] + metric[..., 1, 1]), 0.5 * (metric[..., 0, 0] - metric[..., 1, 1])
+    middle, half = (
+        0.5 * (metric[..., 0, 0] + metric[..., 1, 1]),
+        0.5 * (metric[..., 0, 0] - metric[..., 1, 1]),
+    )
     spread = (half.square() + metric[..., 0, 1].square()).sqrt()
     return torch.maximum((middle + spread).sqrt() - 1, 1 - (middle - spread).clamp_min(0).sqrt())
 

@@ -61,7 +61,7 @@ def energy_gap(task: "DisplacementTask", *, garments: int = 2, iterations: int =
         for sample in task.wardrobe[:garments]:
             case = task.case(sample, batch)
             with torch.no_grad():
-                starts = [task.drape(sample, batch, maps=m) for m in (None, maps)]
+                starts = task.drape(sample, batch, maps=maps)
             free = (sample.ramp[:, 0] > 0).cpu().numpy()
             for index in range(len(batch.posed.vertices)):
                 frame = case.frame(index)
@@ -90,7 +90,9 @@ def minimise(
 
     device = start.device
     # Unknowns are displacements times the root of the mass, on which the energy is better conditioned.
-    scale = (1 / case.rest.mass.clamp_min(1e-9).sqrt())[:, None] * torch.as_tensor(free, device=device)[:, None]
+    scale = (1 / case.rest.mass.clamp_min(1e-9).sqrt())[:, None] * torch.as_tensor(free, device=device)[
+        :, None
+    ]
 
     def energy(unknown: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.tensor(unknown, device=device).reshape(start.shape).requires_grad_(True)

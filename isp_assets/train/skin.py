@@ -10,7 +10,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Eqs. 6-7.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import Body
+from isp_assets.bundle import SkinBundle
+from isp_assets.conventions import JOINT_NAMES, NUM_JOINTS
 from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
+from isp_assets.train.garment_maker import CATEGORIES
 from isp_assets.train.loop import RunOptions, RunReport, train
 
 _HELD_OUT = 1500
@@ -163,10 +166,6 @@ def train_skin(
         diffusion: How the weights spread.
         config: Size of the field; its vertex count and poses are replaced by those given here.
     """
-    from dataclasses import replace
-
-    from isp_assets.bundle import SkinBundle
-
     poses = tuple(tuple(float(x) for x in np.asarray(pose).reshape(-1)) for pose in rest_poses)
     config = config or SkinFieldConfig(num_vertices=len(body.template))
     task = SkinTask(
@@ -181,11 +180,19 @@ def train_skin(
     return report
 
 
+def rest_poses_of_categories() -> list[Float[np.ndarray, "24 3"]]:
+    """Every rest pose [rad] in which the categories of the package are modelled, the T-pose first."""
+    poses = []
+    for angle in sorted({category.leg_angle for category in CATEGORIES.values()} | {0.0}):
+        pose = np.zeros((NUM_JOINTS, 3))
+        pose[JOINT_NAMES.index("left_hip"), 2], pose[JOINT_NAMES.index("right_hip"), 2] = angle, -angle
+        poses.append(pose)
+    return poses
+
+
 def _vertex_area(body: Body) -> Float[Tensor, " N"]:
     """A third of the area of the faces around each vertex [m²]."""
     corner = body.template[body.faces]
     doubled = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(dim=-1)
-    area = torch.zeros(len(body.template))
-    for k in range(3):
-        area.index_add_(0, body.faces[:, k], doubled / 6)
-    return area
+    thirds = (doubled / 6)[:, None].expand(-1, 3).reshape(-1)
+    return torch.zeros(len(body.template)).index_add(0, body.faces.reshape(-1), thirds)
