@@ -20,10 +20,11 @@ from torch import Tensor, nn
 from isp_assets.conventions import PANELS
 from isp_assets.errors import TrainError
 from isp_assets.networks.atlas import Atlas, AtlasConfig
+from isp_assets.train.assemble import assemble_bundle
 from isp_assets.train.atlas_metrics import measure_atlases
 from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places
 from isp_assets.train.dataset import GarmentDataset
-from isp_assets.train.loop import RunOptions, RunReport, read_checkpoint, train
+from isp_assets.train.loop import CHECKPOINT, RunOptions, RunReport, read_checkpoint, train
 from isp_assets.train.patterns import dataset_digest
 
 
@@ -49,12 +50,12 @@ class AtlasOptions:
 def train_atlas(
     dataset: GarmentDataset, patterns: Path, folder: Path, *, run: RunOptions, options: AtlasOptions | None = None
 ) -> RunReport:
-    """Train the atlases of a category.
+    """Train the atlases of a category, and write its bundle, ``<category>.safetensors``.
 
     Args:
         dataset: The dataset that the patterns were trained on.
         patterns: Checkpoint of the pattern training; its codes are used as they are.
-        folder: Where the checkpoint and the history go.
+        folder: Where the bundle, the checkpoint and the history go.
         run: How long and where to train.
         options: Networks and losses.
 
@@ -62,7 +63,10 @@ def train_atlas(
         BundleError: If ``patterns`` cannot be read.
         TrainError: If ``patterns`` belongs to another dataset, or training diverges or cannot resume.
     """
-    return train(AtlasTask(dataset, patterns, options or AtlasOptions(), run), folder, run)
+    report = train(AtlasTask(dataset, patterns, options or AtlasOptions(), run), folder, run)
+    bundle = assemble_bundle(dataset, patterns, folder / CHECKPOINT)
+    bundle.save(folder / f"{dataset.category}.safetensors")
+    return report
 
 
 class AtlasTask:

@@ -209,6 +209,7 @@ class _Run:
         manifest = {
             "task": self.task.name, "config": self.task.config, "seed": self.options.seed, "step": self.step,
             "seconds": self.seconds, "metrics": self.metrics, "measured": self._measured,
+            "device": self.options.device, "threads": torch.get_num_threads(),
         }  # fmt: skip
         save_tensors(self.folder / CHECKPOINT, tensors, manifest, schema=_SCHEMA, version=_VERSION)
 

@@ -1,0 +1,135 @@
+"""From two checkpoints to a garment bundle, with its provenance and its measured errors."""
+
+import copy
+import platform
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+import isp_assets
+from isp_assets.bundle import GarmentBundle, Precision
+from isp_assets.conventions import PANELS
+from isp_assets.errors import TrainError
+from isp_assets.garment_model import GarmentModel
+from isp_assets.networks.atlas import Atlas, AtlasConfig
+from isp_assets.networks.panel_field import PanelField, PanelFieldConfig
+from isp_assets.train.atlas_metrics import measure_atlases
+from isp_assets.train.dataset import GarmentDataset
+from isp_assets.train.loop import read_checkpoint
+from isp_assets.train.pattern_metrics import measure_fields
+
+
+def assemble_bundle(
+    dataset: GarmentDataset, patterns: Path, atlases: Path, *, body_name: str = "default",
+    dtype: Precision = "float16",
+) -> GarmentBundle:  # fmt: skip
+    """Make a bundle of trained networks, rounded to the precision it will be stored at, and measure it.
+
+    Args:
+        dataset: The dataset that both were trained on.
+        patterns: Checkpoint of the pattern training.
+        atlases: Checkpoint of the atlas training.
+        body_name: Name of the body, for people.
+        dtype: Precision of the stored weights.
+
+    Returns:
+        The bundle. Its metrics hold "patterns" and "atlas" at the stored precision, the same under
+        "float32" before rounding, and under "codes" how the latent codes spread.
+
+    Raises:
+        BundleError: If a checkpoint cannot be read.
+        TrainError: If the two checkpoints do not belong together.
+    """
+    pattern_weights, pattern_manifest = read_checkpoint(patterns)
+    atlas_weights, atlas_manifest = read_checkpoint(atlases)
+    _check_pair(patterns, pattern_manifest, atlases, atlas_manifest)
+    field_config = PanelFieldConfig.from_dict(pattern_manifest["config"]["field"])
+    fields, maps = dict[str, PanelField](), dict[str, Atlas]()
+    for side in PANELS:
+        config = AtlasConfig.from_dict(atlas_manifest["config"]["atlas"][side])
+        fields[side] = _load(PanelField(field_config), pattern_weights, f"fields.{side}.")
+        maps[side] = _load(Atlas(config), atlas_weights, f"{side}.")
+    model = GarmentModel(
+        category=dataset.category, panel_fields=fields, atlases=maps, edge_names=dict(dataset.edge_names),
+        seam_pairs=tuple(dataset.seam_pairs), anchor_labels=tuple(dataset.anchor_labels),
+        rest_pose=dataset.rest_pose, panel_center=dataset.panel_center, panel_scale=dataset.panel_scale,
+    )  # fmt: skip
+    codes = pattern_weights["codes"].numpy()
+    stored = model if dtype == "float32" else _rounded(model)
+    metrics = measure_model(stored, codes, dataset) | {"codes": _spread(codes)}
+    if stored is not model:
+        metrics["float32"] = measure_model(model, codes, dataset)
+    return GarmentBundle(
+        stored, {garment.name: code for garment, code in zip(dataset.garments, codes, strict=True)},
+        dataset.body_sha256, body_name, provenance=_provenance(pattern_manifest, atlas_manifest), metrics=metrics,
+    )  # fmt: skip
+
+
+def measure_model(model: GarmentModel, codes: np.ndarray, dataset: GarmentDataset) -> dict[str, Any]:
+    """Errors of the pattern networks over every garment of a dataset."""
+    every, table = range(len(dataset.garments)), torch.from_numpy(codes)
+    return {
+        "patterns": measure_fields(model.panel_fields, table, dataset, garments=every),
+        "atlas": measure_atlases(model.atlases, table, dataset, garments=every),
+    }
+
+
+def _check_pair(patterns: Path, first: Mapping[str, Any], atlases: Path, second: Mapping[str, Any]) -> None:
+    for key, one, two in (
+        ("dataset", first["config"]["dataset_sha256"], second["config"]["dataset_sha256"]),
+        ("step of the patterns", first["step"], second["config"]["patterns_step"]),
+    ):
+        if one != two:
+            raise TrainError(
+                f"{atlases} was trained on another {key} ({two}) than {patterns} has ({one}); train the atlas again"
+            )
+
+
+def _load(network: Any, weights: Mapping[str, torch.Tensor], prefix: str) -> Any:
+    network.load_state_dict(
+        {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}
+    )
+    return network.eval().requires_grad_(False)
+
+
+def _rounded(model: GarmentModel) -> GarmentModel:
+    """The model with 16-bit weights, in 32-bit arithmetic."""
+
+    def rounded(networks: Mapping[str, nn.Module]) -> dict[str, Any]:
+        copies = {side: copy.deepcopy(network) for side, network in networks.items()}
+        for network in copies.values():
+            for parameter in network.parameters():
+                parameter.copy_(parameter.half())
+        return copies
+
+    with torch.no_grad():
+        return replace(model, panel_fields=rounded(model.panel_fields), atlases=rounded(model.atlases))
+
+
+def _spread(codes: np.ndarray) -> dict[str, Any]:
+    """Mean and spread of the codes, for whoever draws codes at random."""
+    radius = np.linalg.norm(codes - codes.mean(0), axis=1)
+    return {
+        "mean": codes.mean(0).tolist(),
+        "std": codes.std(0).tolist(),
+        "radius_mean": float(radius.mean()),
+        "radius_max": float(radius.max()),
+    }
+
+
+def _provenance(patterns: Mapping[str, Any], atlas: Mapping[str, Any]) -> dict[str, Any]:
+    keys = ("seed", "step", "seconds", "device", "threads")
+    return {
+        "dataset_sha256": patterns["config"]["dataset_sha256"],
+        "patterns": {key: patterns.get(key) for key in keys} | {"options": patterns["config"]["options"]},
+        "atlas": {key: atlas.get(key) for key in keys} | {"options": atlas["config"]["options"]},
+        "versions": {
+            "isp_assets": isp_assets.__version__, "torch": torch.__version__, "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }  # fmt: skip
