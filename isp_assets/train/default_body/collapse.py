@@ -101,7 +101,7 @@ class Collapser:
         normal_after, area = self._normal_and_area(after)
         corners = self._points[list(after)]
         longest = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).max())
-        return (
+        return bool(
             normal_before @ normal_after >= _LEAST_NORMAL_COSINE
             and longest <= self._longest[self._region[gone]]
             and 2 * area / (longest**2 + 1e-20) >= _LEAST_ASPECT

@@ -6,6 +6,7 @@ Positions are in metres; MakeHuman is Y up and faces +Z, as SMPL does.
 import gzip
 import itertools
 import json
+import math
 import re
 import zipfile
 from collections.abc import Mapping
@@ -97,9 +98,7 @@ class MakeHuman:
             axes = re.findall(r"{(\w+)}", family)
             for combination in itertools.product(*(corners[axis].items() for axis in axes)):
                 names = {axis: name for axis, (name, _) in zip(axes, combination, strict=True)}
-                self._add(
-                    vertices, family.format(**names), float(np.prod([share for _, share in combination]))
-                )
+                self._add(vertices, family.format(**names), math.prod(share for _, share in combination))
         for (negative, positive), amount in person.local.items():
             self._add(vertices, positive if amount > 0 else negative, abs(amount))
         return vertices

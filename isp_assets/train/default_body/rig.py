@@ -41,11 +41,11 @@ def _slope(degrees: float) -> float:
 
 # Rest direction of the left bone that ends in each joint; the right side is mirrored. Rounded angles.
 _REST = {
-    18: _direction(1, -_slope(3), -_slope(6)),
-    20: _direction(1, _slope(2), 0),
-    22: _direction(1, -_slope(5), -_slope(8)),
-    4: _direction(_slope(5), -1, -_slope(1)),
-    7: _direction(-_slope(2), -1, -_slope(4.5)),
+    18: _direction(1.0, -_slope(3.0), -_slope(6.0)),
+    20: _direction(1.0, _slope(2.0), 0.0),
+    22: _direction(1.0, -_slope(5.0), -_slope(8.0)),
+    4: _direction(_slope(5.0), -1.0, -_slope(1.0)),
+    7: _direction(-_slope(2.0), -1.0, -_slope(4.5)),
 }
 
 

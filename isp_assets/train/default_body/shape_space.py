@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
-from jaxtyping import Bool, Float, Int
-from scipy.optimize import nnls
+from jaxtyping import Float, Int
 
-from isp_assets.conventions import JOINT_PARENTS, NUM_JOINTS
+from isp_assets.train.default_body.joint_regressor import fit_joint_regressor
 from isp_assets.train.default_body.makehuman import MakeHuman
 from isp_assets.train.default_body.people import random_adult
 from isp_assets.train.default_body.rig import FLIP, MIRROR, PELVIS, Rig, to_t_pose
@@ -22,10 +21,6 @@ _MOST_BONES = 4
 _LEAST_WEIGHT = 5e-3
 _TOE_SPREAD = 0.005  # MakeHuman's fourth and fifth toes cut into each other: moved apart by up to this [m]
 _TOE_SHARES = {"toe5": 1.0, "toe4": 0.35, "toe3": 0.0, "toe2": -0.2, "toe1": -0.35}
-_MIDLINE_JOINTS = (0, 3, 6, 9, 12, 15)
-_REGRESSOR_PEOPLE = 160
-_SUM_WEIGHT = 30.0  # how firmly a regressor row is made to sum to 1
-_EVENNESS = 2e-2  # keeps a regressor row spread over a dozen vertices or more
 
 
 @dataclass(frozen=True)
@@ -50,12 +45,11 @@ def build_shape_space(makehuman: MakeHuman, topology: Topology, *, log: Callable
     weights = _limited_weights(rig.weights[topology.base_vertices], topology.mirror)
     people, joints = _population(makehuman, topology, rig, weights, generator)
     log(f"{NUM_PEOPLE} people in the T-pose")
-    regressor = _joint_regressor(people, joints, weights, topology, generator)
-    error = np.linalg.norm(np.einsum("jv,nvd->njd", regressor, people) - joints, axis=2)
-    log(
-        f"joint regressor: mean error {1e3 * error.mean():.1f} mm, worst joint {1e3 * error.mean(0).max():.1f} mm"
-    )
-    people += PELVIS - np.einsum("v,nvd->nd", regressor[0], people)[:, None]
+    regressor = fit_joint_regressor(people, joints, weights, topology, generator)
+    regressed = np.einsum("jv,nvd->njd", regressor, people)
+    error = 1e3 * np.linalg.norm(regressed - joints, axis=2).mean(0)
+    log(f"joint regressor: mean error {error.mean():.1f} mm, of the worst joint {error.max():.1f} mm")
+    people = people - regressed[:, :1] + PELVIS
     template = people.mean(0)
     shape_dirs, explained = _principal_directions(people, topology)
     log(f"{NUM_BETAS} shape directions explain {100 * explained:.1f} % of the variance")
@@ -126,76 +120,10 @@ def _toe_offsets(makehuman: MakeHuman) -> Float[np.ndarray, "M 3"]:
     return offsets
 
 
-def _joint_regressor(
-    people: Float[np.ndarray, "P V 3"], joints: Float[np.ndarray, "P 24 3"], weights: Float[np.ndarray, "V 24"],
-    topology: Topology, generator: np.random.Generator,
-) -> Float[np.ndarray, "24 V"]:  # fmt: skip
-    """Sparse rows that are not negative and sum to 1, fitted over the people; symmetric."""
-    mean, mean_joints, mirror = people.mean(0), joints.mean(0), topology.mirror
-    one_side = np.arange(len(mirror)) < topology.num_midline + topology.num_side
-    regressor = np.zeros((NUM_JOINTS, len(mirror)))
-    for joint in range(NUM_JOINTS):
-        partner = int(MIRROR[joint])
-        if partner < joint:
-            regressor[joint] = regressor[partner][mirror]
-            continue
-        near = _near(joint, mean, mean_joints[joint], weights)
-        if partner == joint:
-            near &= one_side
-        index = np.nonzero(near)[0]
-        chosen = generator.choice(len(people), _REGRESSOR_PEOPLE, replace=False)
-        points = people[chosen][:, index]
-        if partner == joint:
-            points = 0.5 * (points + people[chosen][:, mirror[index]] * FLIP)
-        row = _convex_weights(points - mean_joints[joint], joints[chosen, joint] - mean_joints[joint])
-        if partner == joint:
-            row = row / 2
-            np.add.at(regressor[joint], mirror[index], row)
-        regressor[joint, index] += row
-    return regressor
-
-
-def _near(
-    joint: int,
-    mean: Float[np.ndarray, "V 3"],
-    centre: Float[np.ndarray, "3"],
-    weights: Float[np.ndarray, "V 24"],
-) -> Bool[np.ndarray, " V"]:
-    """The vertices that may take part in a joint's regressor row."""
-    distance = np.linalg.norm(mean - centre, axis=1)
-    if joint in _MIDLINE_JOINTS:  # a slab all around the trunk, neck or head
-        trunk = weights[:, [0, 1, 2, 3, 6, 9, 12, 13, 14, 15]].sum(1) > 0.3
-        return trunk & (np.abs(mean[:, 1] - centre[1]) < (0.10 if joint < 12 else 0.06))
-    if joint in (1, 13):  # hip and collar: everything close by, on this side
-        return (distance < 0.22) & (mean[:, 0] * np.sign(centre[0]) > -0.01)
-    moved = np.nonzero(weights[:, joint] + weights[:, JOINT_PARENTS[joint]] > 0.05)[0]
-    near = np.zeros(len(mean), dtype=bool)
-    near[moved[np.argsort(distance[moved])[:220]]] = True
-    return near
-
-
-def _convex_weights(
-    points: Float[np.ndarray, "P C 3"], targets: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, " C"]:
-    """Weights, none negative, of sum 1, whose mixture of the points comes nearest the targets."""
-    count = points.shape[1]
-    system = np.vstack(
-        [
-            points.transpose(0, 2, 1).reshape(-1, count),
-            _SUM_WEIGHT * np.ones((1, count)),
-            _EVENNESS * np.sqrt(count) * np.eye(count),
-        ]
-    )
-    goal = np.concatenate([targets.reshape(-1), [_SUM_WEIGHT], np.zeros(count)])
-    weights, _ = nnls(system, goal, maxiter=20000)
-    weights[weights < 1e-3] = 0
-    return weights / weights.sum()
-
-
 def _principal_directions(
     people: Float[np.ndarray, "P V 3"], topology: Topology
 ) -> tuple[Float[np.ndarray, "V 3 B"], float]:
-    """Area-weighted principal directions, for coefficients of unit variance; and the variance they explain."""
+    """Area-weighted principal directions for coefficients of unit variance; the variance they explain."""
     mean, faces = people.mean(0), topology.faces
     corners = mean[faces]
     third = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 6

@@ -5,6 +5,7 @@ and capped, head, hands and feet are thinned out, and one half is mirrored.
 Kept vertices are MakeHuman's own, so targets and weights carry over by number.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,12 +22,12 @@ _SHAPE = Phenotype({"gender": 0.5, "height": 0.365})  # where edges are measured
 # Where the pockets begin (left half, MakeHuman's vertex numbers): behind the eyelid, and inside the lips.
 # Found by casting rays outward from every face; one face beyond each loop seeds the flood.
 _EYE = [
-    7748, 7747, 7749, 7750, 7751, 7752, 7753, 7754, 7755, 7756, 11716, 7757, 7758, 7759, 7760, 7761, 7762, 7763,
-    11717, 7764, 7771, 7797, 7796, 7795, 7794, 7798, 7793, 7767, 7766, 7765,
+    7748, 7747, 7749, 7750, 7751, 7752, 7753, 7754, 7755, 7756, 11716, 7757, 7758, 7759, 7760,
+    7761, 7762, 7763, 11717, 7764, 7771, 7797, 7796, 7795, 7794, 7798, 7793, 7767, 7766, 7765,
 ]  # fmt: skip
 _MOUTH = [
-    520, 7267, 7268, 7261, 7262, 11962, 7263, 7181, 7180, 7178, 7193, 7196, 10399, 10400, 7191, 7192, 7195, 10376,
-    7205, 7204, 7197, 7206, 7266, 7265, 7280, 7279, 540,
+    520, 7267, 7268, 7261, 7262, 11962, 7263, 7181, 7180, 7178, 7193, 7196, 10399, 10400, 7191,
+    7192, 7195, 10376, 7205, 7204, 7197, 7206, 7266, 7265, 7280, 7279, 540,
 ]  # fmt: skip
 _SEEDS = ([7787, 7788, 7762, 7761], [7194, 7195, 7192, 7191])
 
@@ -42,8 +43,10 @@ class _Region:
     """Longest edge to make [m]."""
 
 
-_TRUNK_BONES = ("lowerarm", "upperarm", "shoulder", "clavicle", "spine", "breast", "root", "pelvis", "upperleg",
-                "lowerleg", "neck")  # fmt: skip
+_TRUNK_BONES = (
+    "lowerarm", "upperarm", "shoulder", "clavicle", "spine", "breast", "root", "pelvis",
+    "upperleg", "lowerleg", "neck",
+)  # fmt: skip
 _REGIONS = (
     _Region(("",), 600, 0.022),  # the head: every bone that no other region names
     _Region(("finger",), 400, 0.014),
@@ -100,7 +103,7 @@ def build_topology(makehuman: MakeHuman) -> Topology:
 def _in_pocket(quads: Int[np.ndarray, "Q 4"]) -> Bool[np.ndarray, " Q"]:
     """The quads beyond the loops: a flood from the seeds that does not cross them."""
     eye = zip(_EYE, _EYE[1:] + _EYE[:1], strict=True)
-    mouth = zip(_MOUTH[:-1], _MOUTH[1:], strict=True)
+    mouth = itertools.pairwise(_MOUTH)
     walls = {frozenset(edge) for edge in (*eye, *mouth)}
     rows = quads.tolist()
     beside: dict[frozenset[int], list[int]] = {}
@@ -138,9 +141,7 @@ def _edges(faces: Int[np.ndarray, "F 3"]) -> set[tuple[int, int]]:
 def _border_loops(quads: Int[np.ndarray, "Q 4"]) -> list[list[int]]:
     """Closed borders, each in the direction of its faces."""
     sides = (zip(quad, quad[1:] + quad[:1], strict=True) for quad in quads.tolist())
-    directed = dict.fromkeys(
-        edge for side in sides for edge in side
-    )  # a set in order: loops start where quads do
+    directed = dict.fromkeys(edge for side in sides for edge in side)  # a set that keeps its order
     following = {a: b for a, b in directed if (b, a) not in directed}
     loops = []
     while following:
