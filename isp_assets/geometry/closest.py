@@ -131,7 +131,7 @@ class ClosestQuery:
             face = self._subset[face]
         weights = _barycentric(closest, self.vertices[self.topology.faces[face]])
         normal, on_border = self._pseudonormals(face, weights)
-        side = np.where(((points - closest) * normal).sum(1) < 0, -1.0, 1.0)
+        side = np.where(np.einsum("pc,pc->p", points - closest, normal) < 0, -1.0, 1.0)
         return Closest(closest, face, weights, normal, side * np.sqrt(squared), on_border)
 
     def _pseudonormals(
@@ -139,7 +139,7 @@ class ClosestQuery:
     ) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
         topology = self.topology
         zero = weights < _ON_FEATURE
-        zeros = zero.sum(1)
+        zeros = zero[:, 0].astype(np.int8) + zero[:, 1] + zero[:, 2]
         normal = self.face_normals[face]
         on_border = np.zeros(len(face), bool)
         on_edge = np.flatnonzero(zeros == 1)
@@ -154,7 +154,7 @@ class ClosestQuery:
         if len(on_vertex):
             unique, inverse = np.unique(vertex, return_inverse=True)
             normal[on_vertex] = self._vertex_normals(unique)[inverse.reshape(-1)]
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        length = np.sqrt(np.einsum("pc,pc->p", normal, normal))[:, None]
         flat = length[:, 0] < 1e-12  # a fold of 180 degrees: any side is as good, keep the face's
         normal[flat] = self.face_normals[face[flat]]
         return normal / np.where(flat[:, None], 1.0, length), on_border
@@ -180,7 +180,8 @@ def unit_face_normals(
     """Unit normals of faces; zero for a face without area."""
     first, second, third = (vertices[corner] for corner in faces.T)
     cross = np.cross(second - first, third - first)
-    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+    length = np.sqrt(np.einsum("fc,fc->f", cross, cross))
+    return cross / np.maximum(length, 1e-30)[:, None]
 
 
 def signed_heights(
@@ -201,8 +202,7 @@ def _barycentric(
 ) -> Float[np.ndarray, "P 3"]:
     a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     p = point - corner[:, 0]
-    aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
-    pa, pb = (p * a).sum(1), (p * b).sum(1)
+    aa, ab, bb, pa, pb = (np.einsum("pc,pc->p", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))
     area = np.maximum(aa * bb - ab * ab, 1e-30)
     second = (bb * pa - ab * pb) / area
     third = (aa * pb - ab * pa) / area

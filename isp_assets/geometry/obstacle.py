@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceTopology, unit_face_normals
@@ -28,7 +29,8 @@ BODY_PARTS: dict[str, tuple[int, ...]] = {
 }
 """Joints of each part."""
 
-_BELONGS = 0.08  # weight from which a vertex belongs to a part; low, so that parts overlap at their seams
+_BELONGS = 0.3  # weight from which a vertex belongs to a part
+_EXTENDS = 0.08  # weight from which a face counts to a part; lower, so that parts overlap at their seams
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,17 @@ class CollisionMesh:
     """Which of `BODY_PARTS` each vertex belongs to; at least one."""
     part_faces: tuple[Int[np.ndarray, " _"], ...]
     """Faces of each part; parts overlap."""
+
+    @cached_property
+    def neighbour_average(self) -> csr_array:
+        """Matrix [V, V] that averages a field over the neighbours of each vertex."""
+        faces, count = self.topology.faces, len(self.parts)
+        row = np.concatenate([faces, faces]).reshape(-1)
+        column = np.concatenate([np.roll(faces, 1, axis=1), np.roll(faces, -1, axis=1)]).reshape(-1)
+        matrix = csr_array((np.ones(len(row)), (row, column)), shape=(count, count))
+        matrix.data[:] = 1.0  # an inner edge is met twice
+        matrix.data /= np.repeat(np.maximum(np.diff(matrix.indptr), 1), np.diff(matrix.indptr))
+        return matrix
 
     @classmethod
     def build(
@@ -58,7 +71,7 @@ class CollisionMesh:
         parts = weight >= _BELONGS
         parts[np.arange(len(parts)), weight.argmax(1)] = True
         topology = SurfaceTopology.build(faces, len(joint_weights))
-        of_face = parts[topology.faces].any(1)
+        of_face = (weight >= _EXTENDS)[topology.faces].any(1)
         return cls(topology, parts, tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS))))
 
 

@@ -4,7 +4,8 @@ Contact is resolved from both sides: garment vertices are lifted off the surface
 beneath, and the corners of garment triangles are lifted over vertices that poke
 through them. Each lift is spread over the neighbourhood, so that no spike stands
 out; the last rounds lift without spreading, down to the pairs of triangles that
-an exact test still finds crossing.
+an exact test still finds crossing. Only vertices that came near something are
+looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceTopology, unit_face_normals
+from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 
@@ -27,7 +28,13 @@ BODY_MARGIN = 0.003
 LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
-_NEAR = 0.01  # a garment vertex this near [m] to a place without room for cloth is itself without room
+_CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
+_CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
+_WATCHED = 0.02  # vertices this near [m] at the start are looked at again in every round
+_SPREAD_DECAY = 0.9  # part of a lift that the next ring of neighbours follows
+_CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
+_FINISH_STEP = 0.004  # largest lift [m] of one such correction
+_SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
 
 
 @dataclass(frozen=True)
@@ -35,17 +42,19 @@ class ProjectionOptions:
     """How hard to work."""
 
     rounds: int = 4
-    """Rounds of lifting and spreading."""
+    """Rounds of lifting; the last one does not spread."""
     finish: int = 4
     """Rounds of lifting triangles that still cross, at most."""
     spread: int = 8
     """Rings of neighbours that follow a lift."""
     reach: float = 0.06
-    """Own contact deeper than this [m] is left alone: the way out is not known."""
+    """Contact deeper than this [m] is left alone: the way out is not known."""
     foreign_reach: float = 0.015
     """The same for contact with another part of the body."""
     poke_reach: float = 0.015
     """How far a vertex beneath may poke through a triangle [m] and still lift it."""
+    longest_move: float = 0.05
+    """A vertex that was moved this far [m] is caught between surfaces: it counts as having no room."""
     tolerance: float = 1e-4
     """Lifts below this [m] count as none."""
 
@@ -67,14 +76,14 @@ class Projection:
     tight: Bool[np.ndarray, " V"]
     """Vertices where the surfaces beneath leave no room for cloth."""
     crossings: int
-    """Pairs of triangles that still cross."""
+    """Pairs of triangles that still cross, where there is room."""
 
 
 def project(
     vertices: Float[np.ndarray, "V 3"],
     mesh: CollisionMesh,
     obstacles: Sequence[Obstacle],
-    options: ProjectionOptions = ProjectionOptions(),
+    options: ProjectionOptions | None = None,
 ) -> Projection:
     """Lift a garment clear of all obstacles.
 
@@ -90,154 +99,197 @@ def project(
     start = np.ascontiguousarray(vertices, np.float64)
     if not np.isfinite(start).all():
         raise GeometryError("garment positions hold NaN or infinity; check the networks' output")
-    position, average = start, _neighbour_average(mesh.topology)
-    rounds = 0
-    tight = _tight(position, mesh, obstacles)
-    for rounds in range(1, options.rounds + 1):
-        lift = _lift_vertices(position, mesh, obstacles, options, tight, foreign=rounds < options.rounds)
-        poke = (
-            _lift_triangles(position + lift, mesh, obstacles, options, tight)
-            if rounds > 1
-            else np.zeros_like(lift)
+    work = _Projector(start, mesh, obstacles, options or ProjectionOptions())
+    rounds = work.lift()
+    crossings = work.finish()
+    move = float(np.linalg.norm(work.position - start, axis=1).max(initial=0))
+    return Projection(work.position, move > 0, rounds, move, work.tight, crossings)
+
+
+class _Neighbour:
+    """What is known of one obstacle: where the garment comes near it."""
+
+    def __init__(self, obstacle: Obstacle, found: Closest) -> None:
+        self.obstacle = obstacle
+        topology = obstacle.mesh.topology
+        near = np.abs(found.height) < _WATCHED
+        close = np.zeros(len(obstacle.vertices), bool)
+        close[topology.faces[found.face[near]]] = True
+        for _ in range(2):  # garment triangles may be larger than the ones beneath
+            close[topology.faces[_any_corner(close, topology.faces)]] = True
+        self.watched = near
+        self.watched_foreign: Bool[np.ndarray, " V"] | None = None
+        self.vertices = np.flatnonzero(close & ~obstacle.tight)
+        self.faces = np.flatnonzero(_any_corner(close, topology.faces))
+        beneath = _any_corner(obstacle.tight, topology.faces)[found.face]
+        self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
+
+
+class _Projector:
+    """One garment in one frame, while it is being lifted."""
+
+    def __init__(
+        self,
+        position: Float[np.ndarray, "V 3"],
+        mesh: CollisionMesh,
+        obstacles: Sequence[Obstacle],
+        options: ProjectionOptions,
+    ) -> None:
+        self.start = self.position = position
+        self.mesh, self.options = mesh, options
+        first = [o.contacts(position, mesh.parts, within=_WATCHED) for o in obstacles]
+        self.near = [_Neighbour(o, found) for o, found in zip(obstacles, first, strict=True)]
+        self.tight = np.zeros(len(position), bool)
+        for neighbour in self.near:
+            self.tight |= neighbour.cramped
+
+    def lift(self) -> int:
+        """Lift vertices, and triangles from the second round on; the number of rounds taken."""
+        options = self.options
+        for done in range(options.rounds):
+            last = done == options.rounds - 1
+            lift = self._lift_vertices(foreign=not last)
+            if done > 0:
+                _keep_larger(lift, self._lift_triangles(self.position + lift))
+            if np.abs(lift).max(initial=0) < options.tolerance:
+                return done
+            step = _spread(lift, self.mesh.neighbour_average, 0 if last else options.spread)
+            self._move(step)
+        return options.rounds
+
+    def finish(self) -> int:
+        """Lift triangles over the planes of the triangles they still cross; the number left."""
+        crossings = 0
+        for attempt in range(self.options.finish + 1):
+            lift, crossings = np.zeros_like(self.position), 0
+            for neighbour in self.near:
+                pairs = self._crossings(neighbour)
+                crossings += len(pairs)
+                if len(pairs) and attempt < self.options.finish:
+                    _keep_larger(lift, self._part(neighbour.obstacle, pairs))
+            if not lift.any():
+                break
+            self._move(lift)
+        return crossings
+
+    def _move(self, step: Float[np.ndarray, "V 3"]) -> None:
+        self.position = self.position + step
+        total = self.position - self.start
+        moved = (step != 0).any(1)
+        far = np.einsum("vc,vc->v", total, total) > self.options.longest_move**2
+        if far.any():
+            self.tight |= far
+        for neighbour in self.near:
+            neighbour.watched |= moved
+
+    def _lift_vertices(self, *, foreign: bool) -> Float[np.ndarray, "V 3"]:
+        """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
+        own, other = np.zeros_like(self.position), np.zeros_like(self.position)
+        room = np.full(len(self.position), np.inf)
+        for neighbour in self.near:
+            obstacle, index = neighbour.obstacle, np.flatnonzero(neighbour.watched)
+            points, parts = self.position[index], self.mesh.parts[index]
+            margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
+            found = obstacle.contacts(points, parts, within=_WATCHED)
+            _keep_larger(own, _shortest_way(points, found, margin, self.options.reach), index)
+            spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
+            room[index] = np.minimum(room[index], spare)
+            if foreign:
+                self._lift_off_other_parts(neighbour, other)
+        size = np.sqrt(np.einsum("vc,vc->v", other, other))
+        other *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
+        return np.where((own != 0).any(1, keepdims=True), own, other)
+
+    def _lift_off_other_parts(self, neighbour: _Neighbour, lift: Float[np.ndarray, "V 3"]) -> None:
+        obstacle, watched = neighbour.obstacle, neighbour.watched_foreign
+        index = np.arange(len(self.position)) if watched is None else np.flatnonzero(watched)
+        points = self.position[index]
+        found = obstacle.contacts(points, ~self.mesh.parts[index], within=obstacle.margin)
+        if watched is None:
+            neighbour.watched_foreign = np.abs(found.height) < _WATCHED
+        margin = np.full(len(index), obstacle.margin)
+        _keep_larger(lift, _shortest_way(points, found, margin, self.options.foreign_reach), index)
+
+    def _lift_triangles(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+        """Lift the corners of triangles over obstacle vertices that poke through them."""
+        lift = np.zeros_like(position)
+        if not any(len(neighbour.vertices) for neighbour in self.near):
+            return lift
+        query, faces = ClosestQuery(position, self.mesh.topology), self.mesh.topology.faces
+        for neighbour in self.near:
+            obstacle, index = neighbour.obstacle, neighbour.vertices
+            found = query(obstacle.vertices[index])
+            gap = (
+                obstacle.margin / 2
+            )  # vertices already keep the whole margin; half of it allows for their chords
+            facing = np.einsum("pc,pc->p", obstacle.vertex_normals[index], found.normal)
+            poking = (found.height > -gap) & (found.height < self.options.poke_reach) & ~found.on_border
+            hit = np.flatnonzero(poking & (facing > _SAME_SIDE))
+            corner = faces[found.face[hit]]
+            own = (self.mesh.parts[corner].any(1) & obstacle.mesh.parts[index[hit]]).any(1)
+            free = own & ~self.tight[corner].any(1)
+            hit, corner, weights = hit[free], corner[free], found.weights[hit[free]]
+            share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
+            push = ((found.height[hit] + gap)[:, None] * share)[..., None] * found.normal[hit][:, None]
+            _keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
+        return lift
+
+    def _crossings(self, neighbour: _Neighbour) -> Int[np.ndarray, "n 2"]:
+        """Crossing pairs of faces that share a body part and have room."""
+        obstacle, faces, beneath = (
+            neighbour.obstacle,
+            self.mesh.topology.faces,
+            neighbour.obstacle.mesh.topology.faces,
         )
-        lift = lift + poke
-        if np.abs(lift).max(initial=0) < options.tolerance and rounds > 1:
-            break
-        position = position + _spread(lift, average, options.spread if rounds < options.rounds else 0)
-    position, crossings = _finish(position, mesh, obstacles, options, tight)
-    move = np.linalg.norm(position - start, axis=1).max(initial=0)
-    ran = bool(move > 0)
-    return Projection(position if ran else start, ran, rounds, float(move), tight, crossings)
+        mine = np.flatnonzero(_any_corner(neighbour.watched, faces))
+        pairs = crossing_pairs(self.position, faces[mine], obstacle.vertices, beneath[neighbour.faces])
+        pairs = np.stack([mine[pairs[:, 0]], neighbour.faces[pairs[:, 1]]], axis=1)
+        above, below = faces[pairs[:, 0]], beneath[pairs[:, 1]]
+        own = (self.mesh.parts[above].any(1) & obstacle.mesh.parts[below].any(1)).any(1)
+        trapped = self.tight[above].any(1) | obstacle.tight[below].any(1)
+        return pairs[own & ~trapped]
+
+    def _part(self, obstacle: Obstacle, pairs: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "V 3"]:
+        """Lift the garment's triangle of each pair over the plane of the other one."""
+        faces, beneath = self.mesh.topology.faces[pairs[:, 0]], obstacle.mesh.topology.faces[pairs[:, 1]]
+        mine, theirs = unit_face_normals(self.position, faces), obstacle.face_normals[pairs[:, 1]]
+        alike = np.einsum("pc,pc->p", mine, theirs)
+        # Where the other triangle stands across the garment (a fold), its plane leads nowhere: take one's own.
+        plane = np.where((alike > _SAME_SIDE)[:, None], theirs, mine)
+        top = np.einsum("pkc,pc->pk", obstacle.vertices[beneath], plane).max(1)
+        height = np.einsum("pkc,pc->pk", self.position[faces], plane)
+        need = (top[:, None] + _CLEAR - height).clip(0, _FINISH_STEP)
+        push = need[..., None] * plane[:, None] * (alike > -_SAME_SIDE)[:, None, None]
+        return _largest_per_vertex(faces, push, len(self.position))
 
 
-def _tight(
-    position: Float[np.ndarray, "V 3"], mesh: CollisionMesh, obstacles: Sequence[Obstacle]
-) -> Bool[np.ndarray, " V"]:
-    """Garment vertices close to a place without room for cloth."""
-    tight = np.zeros(len(position), bool)
-    for obstacle in obstacles:
-        if obstacle.tight.any():
-            found = obstacle.contacts(position, mesh.parts, within=_NEAR)
-            beneath = obstacle.tight[obstacle.mesh.topology.faces[found.face]].any(1)
-            tight |= beneath & (np.abs(found.height) < _NEAR)
-    return tight
-
-
-def _lift_vertices(
-    position: Float[np.ndarray, "V 3"],
-    mesh: CollisionMesh,
-    obstacles: Sequence[Obstacle],
-    options: ProjectionOptions,
-    tight: Bool[np.ndarray, " V"],
-    *,
-    foreign: bool,
-) -> Float[np.ndarray, "V 3"]:
-    """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
-    own, other = np.zeros_like(position), np.zeros_like(position)
-    room = np.full(len(position), np.inf)
-    for obstacle in obstacles:
-        found = obstacle.contacts(position, mesh.parts, within=options.foreign_reach)
-        margin = np.where(tight, 5e-4, obstacle.margin)
-        _keep_larger(own, _lift(position, found, margin, options.reach))
-        spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
-        room = np.minimum(room, spare)
-        if foreign:
-            found = obstacle.contacts(position, ~mesh.parts, within=obstacle.margin)
-            _keep_larger(other, _lift(position, found, margin, options.foreign_reach))
-    length = np.linalg.norm(other, axis=1)
-    other *= np.minimum(1, room / np.maximum(length, 1e-9))[:, None]
-    return np.where((own != 0).any(1, keepdims=True), own, other)
-
-
-def _lift(
-    position: Float[np.ndarray, "V 3"], found: Closest, margin: Float[np.ndarray, " V"], reach: float
-) -> Float[np.ndarray, "V 3"]:
-    """Shortest way to the margin over one obstacle."""
+def _shortest_way(
+    points: Float[np.ndarray, "P 3"], found: Closest, margin: Float[np.ndarray, " P"], reach: float
+) -> Float[np.ndarray, "P 3"]:
+    """The shortest way from each point to the margin over a surface; none for points that are clear."""
     touching = (found.height < margin) & (found.height > -reach) & ~found.on_border
-    away = np.where(found.height[:, None] >= 0, position - found.point, found.point - position)
-    length = np.linalg.norm(away, axis=1, keepdims=True)
+    away = np.where(found.height[:, None] >= 0, points - found.point, found.point - points)
+    length = np.abs(found.height)[:, None]
     away = np.where(length > 1e-6, away / np.maximum(length, 1e-6), found.normal)
-    return np.where(touching[:, None], (margin - found.height)[:, None].clip(0, 1) * away, 0.0)
+    return np.where(touching[:, None], (margin - found.height).clip(0, 1)[:, None] * away, 0.0)
 
 
-def _lift_triangles(
-    position: Float[np.ndarray, "V 3"],
-    mesh: CollisionMesh,
-    obstacles: Sequence[Obstacle],
-    options: ProjectionOptions,
-    tight: Bool[np.ndarray, " V"],
-) -> Float[np.ndarray, "V 3"]:
-    """Lift the corners of triangles over obstacle vertices that poke through them."""
-    lift, reach = np.zeros_like(position), options.poke_reach
-    query = ClosestQuery(position, mesh.topology)
-    low, high = position.min(0) - reach, position.max(0) + reach
-    for obstacle in obstacles:
-        inside = ((obstacle.vertices > low) & (obstacle.vertices < high)).all(1)
-        index = np.flatnonzero(inside)
-        found = query(obstacle.vertices[index])
-        corner = mesh.topology.faces[found.face]
-        gap = (
-            obstacle.margin / 2
-        )  # vertices already keep the whole margin; half of it allows for their chords
-        poking = (found.height > -gap) & (found.height < reach) & ~found.on_border
-        poking &= (mesh.parts[corner].any(1) & obstacle.mesh.parts[index]).any(1)
-        facing = obstacle.vertex_normals[index]
-        poking &= (facing * found.normal).sum(1) > 0.3
-        poking &= ~(tight[corner].any(1) | obstacle.tight[index])
-        corner, weights = corner[poking], found.weights[poking]
-        share = weights / (weights * weights).sum(1, keepdims=True)
-        push = (found.height[poking] + gap)[:, None, None] * share[..., None] * facing[poking][:, None]
-        _keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
-    return lift
-
-
-def _finish(
-    position: Float[np.ndarray, "V 3"],
-    mesh: CollisionMesh,
-    obstacles: Sequence[Obstacle],
-    options: ProjectionOptions,
-    tight: Bool[np.ndarray, " V"],
-) -> tuple[Float[np.ndarray, "V 3"], int]:
-    """Lift triangles over the planes of the triangles they still cross."""
-    faces = mesh.topology.faces
-    for attempt in range(options.finish + 1):
-        lift, crossings = np.zeros_like(position), 0
-        normals = None
-        for obstacle in obstacles:
-            beneath = obstacle.mesh.topology.faces
-            pairs = crossing_pairs(position, faces, obstacle.vertices, beneath)
-            own = mesh.parts[faces[pairs[:, 0]]].any(1) & obstacle.mesh.parts[beneath[pairs[:, 1]]].any(1)
-            trapped = tight[faces[pairs[:, 0]]].any(1) | obstacle.tight[beneath[pairs[:, 1]]].any(1)
-            pairs = pairs[own.any(1) & ~trapped]
-            crossings += len(pairs)
-            if len(pairs) == 0 or attempt == options.finish:
-                continue
-            normals = unit_face_normals(position, faces) if normals is None else normals
-            mine, theirs = normals[pairs[:, 0]], obstacle.face_normals[pairs[:, 1]]
-            alike = (mine * theirs).sum(1, keepdims=True)
-            plane = np.where(alike > 0.2, theirs, mine)
-            corner = position[faces[pairs[:, 0]]]
-            top = (obstacle.vertices[beneath[pairs[:, 1]]] * plane[:, None]).sum(-1).max(1)
-            need = (top[:, None] + 3e-4 - (corner * plane[:, None]).sum(-1)).clip(0, 0.004)
-            push = need[..., None] * plane[:, None] * (np.abs(alike) > 0.2)[..., None]
-            _keep_larger(lift, _largest_per_vertex(faces[pairs[:, 0]], push, len(position)))
-        if not lift.any():
-            break
-        position = position + lift
-    return position, crossings
-
-
-def _keep_larger(kept: Float[np.ndarray, "V 3"], offered: Float[np.ndarray, "V 3"]) -> None:
-    """Replace rows of ``kept`` where ``offered`` is longer."""
-    larger = (offered * offered).sum(1) > (kept * kept).sum(1)
-    kept[larger] = offered[larger]
+def _keep_larger(
+    kept: Float[np.ndarray, "V 3"],
+    offered: Float[np.ndarray, "n 3"],
+    index: Int[np.ndarray, " n"] | None = None,
+) -> None:
+    """Replace rows of ``kept`` (those of ``index``) where ``offered`` is longer."""
+    rows = kept if index is None else kept[index]
+    larger = np.einsum("vc,vc->v", offered, offered) > np.einsum("vc,vc->v", rows, rows)
+    kept[larger if index is None else index[larger]] = offered[larger]
 
 
 def _largest_per_vertex(
     corner: Int[np.ndarray, "n 3"], push: Float[np.ndarray, "n 3 3"], num_vertices: int
 ) -> Float[np.ndarray, "V 3"]:
     vertex, push = corner.reshape(-1), push.reshape(-1, 3)
-    order = np.argsort((push * push).sum(1), kind="stable")
+    order = np.argsort(np.einsum("vc,vc->v", push, push), kind="stable")
     largest = np.zeros((num_vertices, 3))
     largest[vertex[order]] = push[order]  # the last write to a row wins: the longest push
     return largest
@@ -246,20 +298,11 @@ def _largest_per_vertex(
 def _spread(lift: Float[np.ndarray, "V 3"], average: csr_array, rings: int) -> Float[np.ndarray, "V 3"]:
     """Let neighbours follow: a screened Laplace equation, lifted vertices held, by Jacobi rounds."""
     held = (lift != 0).any(1)
-    if not held.any():
-        return lift
     spread = lift
-    for _ in range(rings):
-        spread = np.where(held[:, None], lift, 0.9 * (average @ spread))
+    for _ in range(rings if held.any() else 0):
+        spread = np.where(held[:, None], lift, _SPREAD_DECAY * (average @ spread))
     return spread
 
 
-def _neighbour_average(topology: SurfaceTopology) -> csr_array:
-    faces, count = topology.faces, len(topology.border_vertex)
-    row, column = np.concatenate([faces, np.roll(faces, 1, axis=1)]).reshape(-1), None
-    column = np.concatenate([np.roll(faces, -1, axis=1), faces]).reshape(-1)
-    ones = csr_array((np.ones(len(row)), (row, column)), shape=(count, count))
-    ones.data[:] = 1.0
-    degree = np.asarray(ones.sum(1)).reshape(-1)
-    ones.data /= np.repeat(np.maximum(degree, 1), np.diff(ones.indptr))
-    return ones
+def _any_corner(mask: Bool[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    return mask[faces[:, 0]] | mask[faces[:, 1]] | mask[faces[:, 2]]
