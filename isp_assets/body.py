@@ -232,10 +232,6 @@ def _from_arrays(data: Mapping[str, Any], *, name: str, where: str) -> Body:
             "SMPL-H and SMPL-X bodies are not supported, use the SMPL file"
         )
     parents = tuple(-1 if parent in (_NO_PARENT, -1) else int(parent) for parent in tree[0])
-    digest = hashlib.sha256()
-    for part in (*real.values(), faces, np.asarray(parents, np.int64)):
-        digest.update(str((part.dtype.str, part.shape)).encode())
-        digest.update(part.tobytes())
     return Body(
         template=torch.from_numpy(real["v_template"]),
         faces=torch.from_numpy(faces),
@@ -245,8 +241,16 @@ def _from_arrays(data: Mapping[str, Any], *, name: str, where: str) -> Body:
         weights=torch.from_numpy(real["weights"]),
         parents=parents,
         name=name,
-        sha256=digest.hexdigest(),
+        sha256=_digest([*real.values(), faces, np.asarray(parents, dtype=np.int64)]),
     )
+
+
+def _digest(arrays: list[np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(str((array.dtype.str, array.shape)).encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 def _check(body: Body) -> None:

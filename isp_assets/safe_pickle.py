@@ -191,7 +191,7 @@ def _number_type(dtype: Any) -> np.dtype:
     order = dtype.state[1] if dtype.state else "="
     if not (isinstance(code, str) and _NUMBER_TYPE.match(code) and order in ("<", ">", "=", "|")):
         raise ValueError(f"array type {code!r} is refused; expected plain numbers")
-    return np.dtype(code).newbyteorder(order)
+    return np.dtype(code if order in "=|" else order + code.lstrip("<>=|"))
 
 
 def _checked_shape(shape: Any) -> tuple[int, ...]:

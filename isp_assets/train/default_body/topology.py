@@ -115,9 +115,9 @@ def _in_pocket(quads: Int[np.ndarray, "Q 4"]) -> Bool[np.ndarray, " Q"]:
     inside[stack] = True
     while stack:
         quad = rows[stack.pop()]
-        for edge in map(frozenset, zip(quad, quad[1:] + quad[:1], strict=True)):
-            if edge not in walls:
-                fresh = [number for number in beside[edge] if not inside[number]]
+        for side in zip(quad, quad[1:] + quad[:1], strict=True):
+            if frozenset(side) not in walls:
+                fresh = [number for number in beside[frozenset(side)] if not inside[number]]
                 inside[fresh] = True
                 stack += fresh
     return inside
