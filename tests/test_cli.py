@@ -1,0 +1,99 @@
+"""The command line in a process of its own: outputs, messages, exit codes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+JOB = 'name = "j"\nmotion = "walk"\nframes = "1-2"\nresolution = 40\noutfit = ["tank_top"]\n'
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "isp_assets.cli", *map(str, arguments)]
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"COLUMNS": "200", "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment, timeout=300)
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Path:
+    path = tmp_path / "job.toml"
+    path.write_text(JOB)
+    return path
+
+
+def test_drape_writes_what_is_asked_for(job: Path, tmp_path: Path) -> None:
+    done = run("drape", job, "--out", tmp_path / "out", "--frames", "3-4", "--write", "usd")
+    assert done.returncode == 0, done.stderr
+    assert "L00_tank_top" in done.stdout
+    assert {p.name for p in (tmp_path / "out").glob("*.*")} == {"j.usdc", "report.json"}
+
+
+def test_plugins_lists_versions() -> None:
+    done = run("plugins")
+    assert done.returncode == 0
+    for name in ("usd", "glb", "rerun", "sheet"):
+        assert name in done.stdout
+    assert "broken" not in done.stdout
+
+
+def test_garments_lists_the_collection() -> None:
+    assert "open_jacket" in run("garments").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("drape", "none.toml", "--out", "o"), 3, "no such file: none.toml"),
+        (("drape", "{job}", "--out", "o", "--frames", "5-"), 3, "not a frame range"),
+        (("drape", "{job}", "--out", "o", "--frames", "1-99999"), 3, "has frames"),
+        (("drape", "{job}", "--out", "o", "--write", "fbx"), 6, "no writer plugin named 'fbx'"),
+        (("drape", "{job}", "--out", "o", "--steps", "skin,glue"), 4, "steps must be some of"),
+        (("drape", "{job}"), 2, "Missing option"),
+        (("garments", "nowhere"), 3, "no such file"),
+        (("train", "patterns", "--data", "x", "--category", "top", "--out", "o"), 5, "steps or of minutes"),
+    ],
+)
+def test_errors_are_one_message_and_a_code(
+    arguments: tuple[str, ...],
+    code: int,
+    message: str,
+    job: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(*(a.format(job=job) for a in arguments))
+    assert done.returncode == code, done.stderr
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "o").exists()
+
+
+def test_interrupt_leaves_nothing_half_written(job: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    job.write_text(JOB.replace("1-2", "1-90").replace("40", "96"))
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        command("drape", job, "--out", out, "--write", "usd,sheet"),
+        env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while not out.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    process.wait(timeout=120)
+    assert process.returncode == 130
+    assert not [p for p in out.rglob("*") if p.is_file()]
+
+
+def test_help_is_quick_to_import() -> None:
+    code = "import sys, isp_assets.cli; sys.exit(any(m in sys.modules for m in ('torch', 'pxr', 'rerun')))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
