@@ -152,7 +152,7 @@ def _print_report(report: dict[str, Any], job: "ShotJob", out: Path) -> None:
     seconds = report["seconds"]["total"]
     out_console.print(f"{len(report['frames'])} frames of [bold]{job.shot.name}[/] in {seconds:.1f} s")
     for file in report["files"].values():
-        out_console.print(f"  {out / file['name']}  {file['bytes'] / 2**20:.1f} MiB")
+        out_console.print(f"  {out / file['path']}  {file['bytes'] / 2**20:.1f} MiB")
     out_console.print(f"  {out / 'report.json'}")
 
 
