@@ -105,7 +105,7 @@ def _checks(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Ima
 def _denim(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Image]:
     twill = _wave(x + y, repeat, pixel)
     warp = _streaks(x, 3, pixel)
-    return 1 + 0.10 * twill + 0.025 * warp, np.clip(0.07 + 0.07 * twill + 0.03 * warp, 0, 1)
+    return 1 + 0.10 * twill + 0.012 * warp, np.clip(0.07 + 0.07 * twill + 0.016 * warp, 0, 1)
 
 
 def _knit(x: Image, y: Image, repeat: float, pixel: float) -> tuple[Image, Image]:
