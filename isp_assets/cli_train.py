@@ -21,6 +21,13 @@ ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the fol
 BodyOption = Annotated[str, typer.Option("--body", help='"default" or an SMPL .npz or .pkl file.')]
 DeviceOption = Annotated[str, typer.Option("--device", help="cpu or cuda.")]
 
+MotionsOption = Annotated[
+    Path | None, typer.Option("--motions", help="Folder of further motions (AMASS-style .npz).")
+]
+HoldOutOption = Annotated[
+    str, typer.Option("--hold-out", help="Motions kept for the test, separated by commas.")
+]
+
 
 @dataset_app.command("make")
 def make(
@@ -75,6 +82,29 @@ def patterns(
     train_patterns(load_dataset(data, category), out, run=run, options=PatternOptions(width=width))
 
 
+@train_app.command("atlas")
+def atlas(
+    data: DataOption,
+    category: CategoryOption,
+    patterns: Annotated[Path, typer.Option("--patterns", help="Output folder of `train patterns`.")],
+    out: OutOption,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    resume: ResumeOption = False,
+    device: DeviceOption = "cpu",
+    width: Annotated[int, typer.Option(help="Width of the atlases.")] = 128,
+) -> None:
+    """Train the maps from the panels to the rest body: CATEGORY.safetensors, a bundle (Eqs. 3-4)."""
+    from isp_assets.train.atlas import AtlasOptions, train_atlas
+    from isp_assets.train.dataset import load_dataset
+    from isp_assets.train.loop import CHECKPOINT
+
+    run = _run(minutes, steps, seed, resume, device)
+    options = AtlasOptions(width=width)
+    train_atlas(load_dataset(data, category), patterns / CHECKPOINT, out, run=run, options=options)
+
+
 @train_app.command("skin")
 def skin(
     out: OutOption,
@@ -104,27 +134,55 @@ def drape(
     resume: ResumeOption = False,
     device: DeviceOption = "cpu",
     body: BodyOption = "default",
-    motions: Annotated[
-        Path | None, typer.Option(help="Folder of further motions (AMASS-style .npz).")
-    ] = None,
-    hold_out: Annotated[str, typer.Option(help="Motions kept for the test, separated by commas.")] = "",
+    motions: MotionsOption = None,
+    hold_out: HoldOutOption = "",
     garments: Annotated[int, typer.Option(help="Garments to learn from.")] = 60,
 ) -> None:
     """Train a category's displacements on physics alone: CATEGORY.safetensors (Eq. 8)."""
     from isp_assets.body import Body
     from isp_assets.bundle import GarmentBundle, SkinBundle
+    from isp_assets.pipeline import split_names
     from isp_assets.train.displacement import DisplacementOptions, train_displacement
     from isp_assets.train.poses import PoseSource
     from isp_assets.train.wardrobe import WardrobeOptions
 
     run = _run(minutes, steps, seed, resume, device)
-    held_out = tuple(name for name in hold_out.split(",") if name)
+    held_out = split_names(hold_out)
     options = DisplacementOptions(
         wardrobe=WardrobeOptions(garments=garments), poses=PoseSource(motions, held_out=held_out)
     )
     train_displacement(
         GarmentBundle.load(bundle), SkinBundle.load(skin), out, run, body=Body.load(body), options=options
     )
+
+
+@train_app.command("layering")
+def layering(
+    bundles: Annotated[
+        list[Path], typer.Option("--bundle", help="Garment bundle with displacements; repeat.")
+    ],
+    skin: Annotated[Path, typer.Option("--skin", help="Skin bundle of the body.")],
+    out: OutOption,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    resume: ResumeOption = False,
+    device: DeviceOption = "cpu",
+    body: BodyOption = "default",
+    motions: MotionsOption = None,
+    hold_out: HoldOutOption = "",
+) -> None:
+    """Train the layering network on random stacks of all bundles: layering.safetensors (Eqs. 9-12)."""
+    from isp_assets.body import Body
+    from isp_assets.bundle import GarmentBundle, SkinBundle
+    from isp_assets.pipeline import split_names
+    from isp_assets.train.layering import LayeringOptions, train_layering
+    from isp_assets.train.poses import PoseSource
+
+    run = _run(minutes, steps, seed, resume, device)
+    options = LayeringOptions(poses=PoseSource(motions, held_out=split_names(hold_out)))
+    garments = [GarmentBundle.load(bundle) for bundle in bundles]
+    train_layering(garments, SkinBundle.load(skin), out, run, body=Body.load(body), options=options)
 
 
 def _run(minutes: float | None, steps: int | None, seed: int, resume: bool, device: str) -> "RunOptions":
