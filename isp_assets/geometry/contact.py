@@ -72,7 +72,9 @@ class Surface:
     @cached_property
     def trees(self) -> list[cKDTree]:
         """One search tree per batch entry; built on first use."""
-        return [cKDTree(points) for points in self.points.reshape(-1, *self.points.shape[-2:]).numpy()]
+        # A balanced tree recurses for ever on exact zeros where torch flushes denormal numbers.
+        samples = self.points.reshape(-1, *self.points.shape[-2:]).numpy()
+        return [cKDTree(points, balanced_tree=False) for points in samples]
 
 
 def clearance(vertices: Float[Tensor, "*batch V 3"], surface: Surface) -> Float[Tensor, "*batch V"]:
