@@ -72,7 +72,10 @@ class MakeHuman:
 
     def bone_weights(self) -> dict[str, list[tuple[int, float]]]:
         """Vertex numbers and weights of MakeHuman's 163 bones."""
-        return json.loads(self._read("rigs/standard/weights.default.json"))["weights"]
+        bones = json.loads(self._read("rigs/standard/weights.default.json"))["weights"]
+        return {
+            name: [(int(vertex), float(weight)) for vertex, weight in rows] for name, rows in bones.items()
+        }
 
     def target(self, name: str) -> tuple[Int[np.ndarray, " K"], Float[np.ndarray, "K 3"]]:
         """Vertex numbers that a morph target moves, and by how much [m]."""
