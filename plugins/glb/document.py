@@ -70,7 +70,7 @@ def build(scene: Scene, body: Part, garments: list[Part], store: TargetStore) ->
     if garments:
         group["children"] = nodes[1:]
     root = file.append("nodes", {"name": scene.name, "children": [nodes[0], file.append("nodes", group)]})
-    file.document |= {"scenes": [{"name": scene.name, "nodes": [root]}], "scene": 0}
+    file.document |= {"scenes": [{"nodes": [root]}], "scene": 0}
     if len(frames) > 1:
         _add_animation(file, scene, nodes, [part.targets.scales for part in parts])
     return file

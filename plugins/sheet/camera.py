@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 _FIELD_OF_VIEW = np.radians(18.0)  # a long lens: bodies keep their proportions
 _BACKDROP = ((0.86, 0.87, 0.89), (0.70, 0.71, 0.74))  # linear light, top and bottom
-_LIGHT = np.array([-0.55, 0.85, 0.75])  # over the camera's left shoulder: right, up, towards the camera
+_LIGHT = np.array([-0.55, 1.05, 0.75])  # over the camera's left shoulder: right, up, towards the camera
 _LIGHT_RADIUS = 0.12
 
 

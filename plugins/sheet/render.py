@@ -21,7 +21,8 @@ from .tracer import Hits, Tracer
 SKIN = (0.66, 0.64, 0.63)
 """Display colour of the body: a neutral grey that leaves the colours to the clothes."""
 
-_GROUND_SHADOW = 0.38
+_GROUND_SHADOW = 0.5
+_GROUND_REACH = 1.4  # the shadow fades to nothing this far from the middle of the picture [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +168,11 @@ class RenderScene:
         missed = missed[rays[missed, 1] < -1e-6]
         direction = rays[missed]
         point = view.eye + ((ground - view.eye[1]) / direction[:, 1])[:, None] * direction
-        near = (np.abs(point[:, 0] - view.target[0]) < 2.0) & (np.abs(point[:, 2] - view.target[2]) < 2.0)
-        blocked = self._tracer.blocked(point[near], np.broadcast_to(light, (int(near.sum()), 3)))
-        flat[missed[near][blocked]] *= 1.0 - _GROUND_SHADOW
+        away = np.linalg.norm((point - view.target)[:, [0, 2]], axis=1)
+        near = np.flatnonzero(away < _GROUND_REACH)
+        blocked = self._tracer.blocked(point[near], np.broadcast_to(light, (len(near), 3)))
+        dark = near[blocked]
+        flat[missed[dark]] *= 1.0 - (_GROUND_SHADOW * (1.0 - away[dark] / _GROUND_REACH))[:, None]
 
 
 def _texel_size(mesh: RenderMesh) -> float:
