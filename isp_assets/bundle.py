@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,12 +25,10 @@ from isp_assets.garment import Garment
 from isp_assets.garment_model import GarmentModel
 from isp_assets.networks.atlas import Atlas, AtlasConfig
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
+from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.networks.panel_field import PanelField, PanelFieldConfig
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.storage import load_tensors, save_tensors
-
-if TYPE_CHECKING:
-    from isp_assets.networks.layering_net import LayeringNet
 
 Precision = Literal["float16", "float32"]
 _GARMENTS, _SKIN, _LAYERING = ("isp-assets/garments", 1), ("isp-assets/skin", 1), ("isp-assets/layering", 1)
@@ -189,7 +187,7 @@ class SkinBundle:
 class LayeringBundle:
     """The network that moves a garment clear of what it is worn over."""
 
-    layering_net: "LayeringNet"
+    layering_net: LayeringNet
     provenance: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
@@ -204,8 +202,6 @@ class LayeringBundle:
         Raises:
             BundleError: If the file is missing, damaged, too new or of another kind.
         """
-        from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
-
         tensors, manifest = load_tensors(path, schema=_LAYERING[0], version=_LAYERING[1])
         with _reading(path):
             net = _unpack(LayeringNet(LayeringConfig.from_dict(manifest["network"])), "network", tensors)

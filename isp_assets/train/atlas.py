@@ -39,11 +39,11 @@ class AtlasOptions:
     """lambda_n of Eq. 4."""
     seam_weight: float = 0.5
     """lambda_c of Eq. 4, but of the mean gap in metres: its square, as in the paper, fades before the gap does."""
-    rate: float = 1e-3
-    garments_per_step: int = 16
-    faces_per_step: int = 128
+    rate: float = 1.5e-3
+    garments_per_step: int = 24
+    faces_per_step: int = 24
     """Triangles a garment and panel; all three corners are evaluated."""
-    seams_per_step: int = 96
+    seams_per_step: int = 24
     """Seam vertices a garment."""
 
 

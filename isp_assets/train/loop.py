@@ -12,13 +12,14 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from isp_assets.errors import TrainError
 from isp_assets.storage import load_tensors, save_tensors
+from isp_assets.train.cpu import prepare_cpu
 from isp_assets.train.history import History
 from isp_assets.train.progress import ProgressView, interrupt_flag
 
@@ -26,6 +27,7 @@ CHECKPOINT = "checkpoint.safetensors"
 _SCHEMA, _VERSION = "isp-assets/checkpoint", 1
 
 
+@runtime_checkable
 class Task(Protocol):
     """What is trained."""
 
@@ -105,10 +107,7 @@ def train(task: Task, folder: Path, options: RunOptions) -> RunReport:
         TrainError: If a loss is no longer finite, or a checkpoint does not belong to the task.
         KeyboardInterrupt: After saving a checkpoint, if the user interrupted.
     """
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    # Softplus(beta=100) yields denormal numbers, which cost a CPU four times the time.
-    torch.set_flush_denormal(True)
+    prepare_cpu(options.threads)
     run = _Run(task, Path(folder), options)
     if options.resume:
         run.restore()

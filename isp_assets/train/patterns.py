@@ -34,11 +34,11 @@ class PatternOptions:
     """lambda_CE of Eq. 2."""
     code_weight: float = 1e-4
     """lambda_reg of Eq. 2; keeps codes close together, so that what lies between them is a garment too."""
-    field_rate: float = 1e-3
+    field_rate: float = 1.5e-3
     code_rate: float = 2e-3
-    garments_per_step: int = 16
-    points_per_step: int = 512
-    """Points a garment and panel."""
+    garments_per_step: int = 24
+    points_per_step: int = 96
+    """Points a garment and panel. Many small steps beat few large ones, by far."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
 
     def field_config(self, num_labels: int) -> PanelFieldConfig:

@@ -1,0 +1,131 @@
+"""Pattern and atlas training on three sewn tubes, from data to a bundle that decodes."""
+
+import numpy as np
+import pytest
+import torch
+from training_sets import tube_dataset
+
+from isp_assets.bundle import GarmentBundle
+from isp_assets.errors import DatasetError, TrainError
+from isp_assets.train.assemble import assemble_bundle
+from isp_assets.train.atlas import AtlasOptions, AtlasTask, train_atlas
+from isp_assets.train.atlas_metrics import measure_atlases
+from isp_assets.train.atlas_samples import AtlasSamples, places, seam_indices
+from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint
+from isp_assets.train.pattern_metrics import measure_fields
+from isp_assets.train.patterns import PatternOptions, dataset_digest, panel_outline, train_patterns
+from isp_assets.train.sampling import SamplingOptions
+
+PATTERNS = PatternOptions(code_size=4, width=24, field_rate=3e-3, sampling=SamplingOptions(points=2000))
+ATLAS = AtlasOptions(width=24, depth=4, skip=2, rate=3e-3)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder, dataset = tmp_path_factory.mktemp("tube"), tube_dataset()
+    torch.manual_seed(0)
+    train_patterns(dataset, folder / "patterns", run=RunOptions(steps=300, measurements=1), options=PATTERNS)
+    checkpoint = folder / "patterns" / CHECKPOINT
+    train_atlas(dataset, checkpoint, folder / "atlas", run=RunOptions(steps=300, measurements=1), options=ATLAS)
+    return dataset, folder
+
+
+def test_the_bundle_knows_the_garments(trained):
+    dataset, folder = trained
+    bundle = GarmentBundle.load(folder / "atlas" / "tube.safetensors")
+    assert list(bundle.codes) == ["tube_0", "tube_1", "tube_2"]
+    assert bundle.metrics["patterns"]["iou"] > 0.9
+    assert bundle.metrics["patterns"]["border_mm"] < 10
+    assert bundle.metrics["patterns"]["label_accuracy"] > 0.85
+    assert bundle.metrics["atlas"]["vertex_mm"] < 15
+    assert bundle.metrics["atlas"]["seam_mm"] < 15
+    assert bundle.metrics["float32"]["atlas"]["vertex_mm"] == pytest.approx(bundle.metrics["atlas"]["vertex_mm"], rel=0.02)
+    assert len(bundle.metrics["codes"]["std"]) == 4
+    assert bundle.provenance["patterns"]["step"] == 300
+    assert bundle.provenance["dataset_sha256"] == dataset_digest(dataset)
+    garment = bundle.decode("tube_1", resolution=48)
+    assert np.ptp(garment.panels["front"].panel_xy, axis=0) == pytest.approx([0.5, 0.5], abs=0.06)
+    assert len(garment.seams) == 2
+
+
+def test_metrics_of_stored_weights_are_those_of_the_file(trained):
+    dataset, folder = trained
+    bundle = GarmentBundle.load(folder / "atlas" / "tube.safetensors")
+    codes = torch.from_numpy(np.stack(list(bundle.codes.values())))
+    found = measure_atlases(bundle.model.atlases, codes, dataset, garments=range(3))
+    assert found == pytest.approx(bundle.metrics["atlas"], rel=1e-4)
+
+
+def test_parts_of_different_runs_are_refused(trained, tmp_path):
+    dataset, folder = trained
+    train_patterns(dataset, tmp_path, run=RunOptions(steps=2, measurements=1), options=PATTERNS)
+    with pytest.raises(TrainError, match="step of the patterns"):
+        assemble_bundle(dataset, tmp_path / CHECKPOINT, folder / "atlas" / CHECKPOINT)
+    with pytest.raises(TrainError, match="another dataset"):
+        AtlasTask(tube_dataset((0.3, 0.4)), tmp_path / CHECKPOINT, ATLAS, RunOptions(steps=1))
+
+
+def test_resuming_pattern_training_is_exact(tmp_path):
+    dataset, options = tube_dataset(), PATTERNS
+    train_patterns(dataset, tmp_path / "whole", run=RunOptions(steps=6, hold=1.0), options=options)
+    for steps in (3, 6):
+        run = RunOptions(steps=steps, hold=1.0, resume=True)
+        train_patterns(dataset, tmp_path / "parts", run=run, options=options)
+    whole, parts = (read_checkpoint(tmp_path / name / CHECKPOINT)[0] for name in ("whole", "parts"))
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_an_empty_dataset_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="no garment"):
+        train_patterns(tube_dataset(()), tmp_path, run=RunOptions(steps=1))
+
+
+def test_the_digest_sees_every_garment():
+    digests = {dataset_digest(tube_dataset(widths)) for widths in ((0.4, 0.5), (0.5, 0.4), (0.4, 0.5001), (0.4,))}
+    assert len(digests) == 4
+
+
+class _Rectangle(torch.nn.Module):
+    """The exact field of a tube's panel, off by a constant."""
+
+    def __init__(self, half: torch.Tensor, center: torch.Tensor, error: float) -> None:
+        super().__init__()
+        self.half, self.center, self.error = half, center, error
+
+    def forward(self, xy, code):
+        over = (xy - self.center).abs() - self.half
+        distance = over.clamp_min(0).norm(dim=-1) + over.amax(-1).clamp_max(0)
+        return distance + self.error, torch.nn.functional.one_hot(torch.ones(len(xy), dtype=torch.long), 5).float()
+
+
+@pytest.mark.parametrize("error", [0.0, 0.01])
+def test_metrics_of_a_known_field(error):
+    dataset = tube_dataset((0.5,))
+    outline = panel_outline(dataset, dataset.garments[0].panels["front"]).points
+    low, high = (torch.tensor(f(0), dtype=torch.float64) for f in (outline.min, outline.max))
+    field = _Rectangle((high - low) / 2, (high + low) / 2, error)
+    fields = {"front": field, "back": field}
+    found = measure_fields(fields, torch.zeros(1, 4).double(), dataset, garments=[0])
+    assert found["distance_mm"] == pytest.approx(1000 * error * dataset.panel_scale, abs=1e-3)
+    assert found["border_mm"] == pytest.approx(1000 * error * dataset.panel_scale, abs=1e-3)
+    assert found["border_label_accuracy"] == pytest.approx(0.25, abs=0.05)
+    assert found["iou"] == pytest.approx(1 if error == 0 else (0.49 / 0.5) ** 2, abs=0.02)
+
+
+def test_seam_samples_lie_on_both_panels():
+    dataset = tube_dataset()
+    samples = AtlasSamples(dataset, torch.device("cpu"))
+    seam = samples.seams(torch.tensor([2, 0]), 50, torch.Generator().manual_seed(0))
+    assert torch.equal(seam["front"][..., 2:], seam["back"][..., 2:])
+    half = torch.tensor([0.3, 0.2])[:, None] / dataset.panel_scale
+    torch.testing.assert_close(seam["front"][..., 0].abs(), half.expand(2, 50))
+    triangles = samples.triangles("back", torch.tensor([1]), 20, torch.Generator().manual_seed(0))
+    assert triangles.shape == (1, 20, 3, 5)
+    assert (triangles[..., 4] < 1e-6).all()
+
+
+def test_seam_indices_match():
+    garment = tube_dataset().garments[1]
+    index = seam_indices(garment)
+    np.testing.assert_array_equal(*(places(garment, side)[index[side]] for side in ("front", "back")))
+    assert len(index["front"]) == 18
