@@ -19,7 +19,12 @@ def strip(nx: int, ny: int, width: float = 0.3, height: float = 0.1):
     faces = []
     for i in range(nx):
         for j in range(ny):
-            a, b, c, d = (i * (ny + 1) + j, (i + 1) * (ny + 1) + j, (i + 1) * (ny + 1) + j + 1, i * (ny + 1) + j + 1)
+            a, b, c, d = (
+                i * (ny + 1) + j,
+                (i + 1) * (ny + 1) + j,
+                (i + 1) * (ny + 1) + j + 1,
+                i * (ny + 1) + j + 1,
+            )
             faces += [(a, b, c), (a, c, d)] if (i + j) % 2 else [(a, b, d), (b, c, d)]
     faces = np.array(faces)
     return xy, faces, xy[faces]
@@ -61,7 +66,9 @@ def test_simple_shear_is_the_stvk_density_times_the_area():
     gradient = np.array([[1.0, 0.3], [0.0, 1.0]])
     green = (gradient.T @ gradient - np.eye(2)) / 2
     expected = 0.03 * (FABRIC.mu * (green**2).sum() + 0.5 * FABRIC.lam * np.trace(green) ** 2)
-    assert membrane_energy(in_space(xy @ gradient.T), rest, FABRIC).item() == pytest.approx(expected, rel=1e-12)
+    assert membrane_energy(in_space(xy @ gradient.T), rest, FABRIC).item() == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 def lattice(spacing: float, turn: float, size: float = 0.3):
@@ -72,7 +79,9 @@ def lattice(spacing: float, turn: float, size: float = 0.3):
     grid[1::2, :, 0] += spacing / 2
     xy = grid.reshape(-1, 2)
     faces = Delaunay(xy).simplices
-    inside = (np.linalg.norm(xy[faces].mean(1), axis=-1) < 0.1) & (np.linalg.norm(np.ptp(xy[faces], axis=1), axis=-1) < 2 * spacing)
+    inside = (np.linalg.norm(xy[faces].mean(1), axis=-1) < 0.1) & (
+        np.linalg.norm(np.ptp(xy[faces], axis=1), axis=-1) < 2 * spacing
+    )
     used, faces = np.unique(faces[inside], return_inverse=True)
     faces = faces.reshape(-1, 3)
     xy = xy[used] @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -98,7 +107,9 @@ def test_a_shallow_bowl_costs_the_squared_mean_curvature():
     """``k/2 (3 + 3 - 2) kappa^2`` per area."""
     xy, faces, corners, area = lattice(0.004, 0.0)
     rest = cloth_rest(faces, corners, len(xy), FABRIC)
-    bowl = in_space(xy) + torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64) * in_space(xy).square().sum(-1, keepdim=True)
+    bowl = in_space(xy) + torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64) * in_space(xy).square().sum(
+        -1, keepdim=True
+    )
     expected = 0.5 * FABRIC.bending * 4 * area
     assert bending_energy(bowl, rest, FABRIC).item() == pytest.approx(expected, rel=0.05)
 

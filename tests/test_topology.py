@@ -9,7 +9,9 @@ from isp_assets.errors import GeometryError
 from isp_assets.geometry.topology import boundary_loops, edges, hinges, weld
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-RING = np.array([[i, (i + 1) % 6, i + 6] for i in range(6)] + [[(i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)])
+RING = np.array(
+    [[i, (i + 1) % 6, i + 6] for i in range(6)] + [[(i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+)
 
 
 def test_edges_of_a_closed_mesh_have_two_faces():

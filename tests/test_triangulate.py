@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -127,3 +128,9 @@ def test_points_in_polygon_follows_the_even_odd_rule():
 def test_bad_outlines_are_named(loops, spacing, match):
     with pytest.raises(GeometryError, match=match):
         triangulate_panel(loops, spacing)
+
+
+def test_an_outline_on_the_axes_is_filled_while_torch_flushes_denormals():
+    """Exact zeros and flushed denormals once sent the neighbour search into endless recursion."""
+    torch.set_flush_denormal(True)
+    check([polygon([(0, 0), (0.2, 0), (0.2, 0.2), (0, 0.2)], 0.02)], 0.02)

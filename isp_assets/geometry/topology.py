@@ -55,7 +55,8 @@ def hinges(faces: Int[np.ndarray, "F 3"]) -> Hinges:
     if (mesh.num_faces > 2).any():
         worst = mesh.vertices[mesh.num_faces.argmax()]
         raise GeometryError(
-            f"mesh is not a surface: edge {worst.tolist()} has {mesh.num_faces.max()} faces, expected at most 2"
+            f"mesh is not a surface: edge {worst.tolist()} has {mesh.num_faces.max()} faces, "
+            "expected at most 2"
         )
     order = np.argsort(mesh.face_edge.reshape(-1), kind="stable")
     start = np.searchsorted(mesh.face_edge.reshape(-1)[order], np.flatnonzero(mesh.num_faces == 2))
@@ -86,7 +87,9 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[Int[np.ndarray, " n"]]
     border = directed[mesh.num_faces[mesh.face_edge.reshape(-1)] == 1]
     following = dict(border.tolist())
     if len(following) != len(border) or set(following) != set(following.values()):
-        raise GeometryError("border of the mesh is not a set of separate loops: loops touch, or faces are wound both ways")
+        raise GeometryError(
+            "border of the mesh is not a set of separate loops: loops touch, or faces are wound both ways"
+        )
     loops, remaining = [], set(following)
     for start in sorted(following):
         if start not in remaining:

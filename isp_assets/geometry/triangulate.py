@@ -44,7 +44,9 @@ def triangulate_panel(
     num_border = sum(map(len, loops))
     border, inner, faces, start, inner_start = [], [], [], 0, num_border
     for number, loop in enumerate(loops):
-        lattice, triangles = _fill(np.asarray(loop, dtype=np.float64), spacing, where=f"outline loop {number}")
+        lattice, triangles = _fill(
+            np.asarray(loop, dtype=np.float64), spacing, where=f"outline loop {number}"
+        )
         index = np.concatenate([start + np.arange(len(loop)), inner_start + np.arange(len(lattice))])
         border.append(loop)
         inner.append(lattice)
@@ -53,7 +55,9 @@ def triangulate_panel(
     return np.concatenate([*border, *inner]).astype(np.float64), np.concatenate(faces)
 
 
-def points_in_polygon(points: Float[np.ndarray, "n 2"], loop: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " n"]:
+def points_in_polygon(
+    points: Float[np.ndarray, "n 2"], loop: Float[np.ndarray, "m 2"]
+) -> Bool[np.ndarray, " n"]:
     """Tell which points lie inside a closed polygon, by the even-odd rule."""
     return _enclosed(points, loop, np.roll(loop, -1, axis=0))
 
@@ -84,7 +88,9 @@ def _fill(loop: Float[np.ndarray, "n 2"], spacing: float, *, where: str):
     only the strip between them and the outline is left to compute.
     """
     if loop.ndim != 2 or loop.shape[1] != 2 or len(loop) < 3 or not np.isfinite(loop).all():
-        raise GeometryError(f"{where}: expected at least 3 finite points of shape [n, 2], got shape {loop.shape}")
+        raise GeometryError(
+            f"{where}: expected at least 3 finite points of shape [n, 2], got shape {loop.shape}"
+        )
     lattice, regular, buried = _lattice_inside(loop, spacing)
     points = np.concatenate([loop, lattice])
     regular = regular + len(loop)
@@ -106,18 +112,21 @@ def _fill(loop: Float[np.ndarray, "n 2"], spacing: float, *, where: str):
 
 
 def _lattice_inside(loop: Float[np.ndarray, "n 2"], spacing: float):
-    """Lattice points inside a loop, the triangles among those far from it, and which points have no others."""
+    """Lattice points inside a loop, triangles among those far from it, which points have no others."""
     low, high = loop.min(axis=0), loop.max(axis=0)
     row_height = spacing * np.sqrt(3) / 2
     rows = np.arange(np.floor(low[1] / row_height) - 1, np.ceil(high[1] / row_height) + 2)
     columns = np.arange(np.floor(low[0] / spacing) - 1, np.ceil(high[0] / spacing) + 2)
     column, row = np.meshgrid(columns, rows)
-    lattice = np.stack([(column + 0.5 * (np.abs(row) % 2)) * spacing, row * row_height], axis=-1).reshape(-1, 2)
+    lattice = np.stack([(column + 0.5 * (np.abs(row) % 2)) * spacing, row * row_height], axis=-1).reshape(
+        -1, 2
+    )
     inside = np.flatnonzero(points_in_polygon(lattice, loop))
     step = np.linspace(0, 1, 6)[:-1, None, None]
     dense = (loop + step * (np.roll(loop, -1, axis=0) - loop)).reshape(-1, 2)
     distance = np.zeros(len(lattice))
-    distance[inside], _ = cKDTree(dense).query(lattice[inside])
+    # A balanced tree recurses for ever on exact zeros where torch flushes denormal numbers.
+    distance[inside], _ = cKDTree(dense, balanced_tree=False).query(lattice[inside])
     kept = np.flatnonzero(distance > _CLEARANCE * spacing)
     deep = (distance > _DEEP * spacing).reshape(row.shape)
     triangles, used = _lattice_triangles(deep, np.abs(rows) % 2 == 1)
@@ -148,7 +157,9 @@ def _double_area(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
-def _counter_clockwise(points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F 3"]:
+def _counter_clockwise(
+    points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "F 3"]:
     flipped = _double_area(points, faces) < 0
     return np.where(flipped[:, None], faces[:, [0, 2, 1]], faces)
 
@@ -179,19 +190,26 @@ def _recover_edge(points, faces, a: int, b: int, *, where: str) -> None:
         pair = np.flatnonzero((faces == p).any(axis=1) & (faces == q).any(axis=1))
         r, s = (int(np.setdiff1d(faces[t], (p, q))[0]) for t in pair)
         if not _crosses(points[p], points[q], points[r], points[s]):
-            waiting.append((p, q))  # the two triangles are not convex together; another flip will make them so
+            waiting.append(
+                (p, q)
+            )  # the two triangles are not convex together; another flip will make them so
             continue
         faces[pair] = _counter_clockwise(points, np.array([[r, s, p], [s, r, q]]))
         if _crosses(points[a], points[b], points[r], points[s]):
             waiting.append((r, s))
     if waiting:
-        raise GeometryError(f"{where}: cannot keep the outline edge {a}-{b} near {points[a].round(4).tolist()}; does the outline cross itself?")
+        raise GeometryError(
+            f"{where}: cannot keep the outline edge {a}-{b} near {points[a].round(4).tolist()}; "
+            "does the outline cross itself?"
+        )
 
 
 def _edges_across(points, faces, a: int, b: int) -> list[tuple[int, int]]:
     """Inner edges that cross the segment ab."""
     directed = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
-    inner = directed[(directed[:, 0] < directed[:, 1]) & np.isin(_edge_keys(directed), _edge_keys(directed[:, ::-1]))]
+    inner = directed[
+        (directed[:, 0] < directed[:, 1]) & np.isin(_edge_keys(directed), _edge_keys(directed[:, ::-1]))
+    ]
     return [(int(p), int(q)) for p, q in inner if _crosses(points[a], points[b], points[p], points[q])]
 
 
@@ -204,11 +222,14 @@ def _check_filled(points, faces, loop, *, where: str) -> None:
     expected = np.sort(_edge_keys(np.sort(np.stack([np.arange(n), (np.arange(n) + 1) % n], 1), axis=1)))
     if not np.array_equal(border, expected):
         raise GeometryError(
-            f"{where}: the outline is not kept by its triangulation ({len(border)} border edges, expected {n}); "
-            "does the outline cross itself, or is it thinner than the spacing?"
+            f"{where}: the outline is not kept by its triangulation ({len(border)} border edges, not {n});"
+            " does the outline cross itself, or is it thinner than the spacing?"
         )
     following = np.roll(loop, -1, axis=0)
     area = abs((loop[:, 0] * following[:, 1] - loop[:, 1] * following[:, 0]).sum())
     filled = _double_area(points, faces).sum()
     if abs(filled - area) > 1e-6 * area or (np.bincount(faces.reshape(-1), minlength=len(points)) == 0).any():
-        raise GeometryError(f"{where}: triangles cover {filled / 2:.6g} m^2 of {area / 2:.6g} m^2; does the outline cross itself?")
+        raise GeometryError(
+            f"{where}: triangles cover {filled / 2:.6g} m^2 of {area / 2:.6g} m^2; "
+            "does the outline cross itself?"
+        )

@@ -33,12 +33,12 @@ class DepthMap:
 
     def runs_in_row(self, y: float) -> Float[np.ndarray, "n 2"]:
         """Intervals of x inside the silhouette at height ``y`` [m], from -x to +x."""
-        row = self.mask[int(round((y - self.origin[1]) / self.cell))]
+        row = self.mask[round((y - self.origin[1]) / self.cell)]
         return self.origin[0] + self.cell * _runs(row)
 
     def runs_in_column(self, x: float) -> Float[np.ndarray, "n 2"]:
         """Intervals of y inside the silhouette at ``x`` [m], upwards."""
-        column = self.mask[:, int(round((x - self.origin[0]) / self.cell))]
+        column = self.mask[:, round((x - self.origin[0]) / self.cell)]
         return self.origin[1] + self.cell * _runs(column)
 
 
@@ -76,19 +76,24 @@ def depth_map(
     y = low[face, 1] + rank // np.maximum(span[face, 0], 1)
     a, b, c = (corner[face, k] for k in range(3))
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / area
         wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])) / area
-    hit = (np.abs(area) > 1e-9) & (wb >= -1e-6) & (wc >= -1e-6) & (wb + wc <= 1 + 1e-6)
-    depth = (1 - wb - wc) * a[:, 2] + wb * b[:, 2] + wc * c[:, 2]
+        hit = (np.abs(area) > 1e-9) & (wb >= -1e-6) & (wc >= -1e-6) & (wb + wc <= 1 + 1e-6)
+    x, y, wb, wc, corners = x[hit], y[hit], wb[hit], wc[hit], corner[face[hit]]
+    depth = corners[:, 0, 2] * (1 - wb - wc) + corners[:, 1, 2] * wb + corners[:, 2, 2] * wc
     front, back = np.full(size[::-1], -np.inf), np.full(size[::-1], np.inf)
-    np.maximum.at(front, (y[hit], x[hit]), depth[hit])
-    np.minimum.at(back, (y[hit], x[hit]), depth[hit])
+    np.maximum.at(front, (y, x), depth)
+    np.minimum.at(back, (y, x), depth)
     return DepthMap(origin=origin, cell=cell, front=front, back=back)
 
 
 def distance_grid(
-    vertices: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"], *, cell: float = 0.008, band: float = 0.05
+    vertices: Float[np.ndarray, "N 3"],
+    faces: Int[np.ndarray, "F 3"],
+    *,
+    cell: float = 0.008,
+    band: float = 0.05,
 ) -> DistanceGrid:
     """Signed distance to a closed body: exact in a band about the surface, clamped to ``band`` beyond.
 
@@ -119,7 +124,7 @@ def distance_grid(
     values[near] = np.clip(sign * distance, -band, band)
     region, _ = ndimage.label(~near)
     values[(region > 0) & (region != region[0, 0, 0])] = -band
-    if not (values < 0).any():
+    if not (values[near] < 0).any():
         raise BodyError("body mesh has no inside; it must be closed with faces wound outwards")
     return DistanceGrid(values=values, origin=low, cell=cell)
 

@@ -13,10 +13,8 @@ named presets, the rest are random.
 import json
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +23,12 @@ from jaxtyping import Float, Int
 from isp_assets.conventions import PANELS
 from isp_assets.errors import DatasetError
 from isp_assets.train.garment_maker import CATEGORIES, FILE_VERSION, GarmentMaker, Recipe
+from isp_assets.train.worker_pool import run_tasks
 
 Progress = Callable[[int, int, str], None]
 
 _SCHEMA = "isp-assets/dataset"
 _VERSION = 1
-_POOL_RESTARTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,7 @@ class TrainingPanel:
     xy: Float[np.ndarray, "P 2"]
     """Flat positions [m]; the outline's points come first."""
     faces: Int[np.ndarray, "F 3"]
-    """Wound so that the sewn surface faces outwards: the front counter-clockwise in xy, the back clockwise."""
+    """Wound so that the sewn surface faces outwards: the front counter-clockwise in xy, the back not."""
     vertex_index: Int[np.ndarray, " P"]
     """Garment vertex of each panel point."""
     outline_xy: Float[np.ndarray, "M 2"]
@@ -112,7 +110,10 @@ def make_dataset(
     out = Path(out)
     unknown = set(counts) - set(CATEGORIES)
     if unknown or not counts or min(counts.values()) < 1 or workers < 1:
-        raise DatasetError(f"expected counts >= 1 for categories among {sorted(CATEGORIES)} and workers >= 1, got {dict(counts)}, workers={workers}")
+        raise DatasetError(
+            f"expected counts >= 1 for categories among {sorted(CATEGORIES)} and workers >= 1, "
+            f"got {dict(counts)}, workers={workers}"
+        )
     recipe = Recipe(out=str(out), seed=seed, body=str(body), edge_length=edge_length)
     maker = GarmentMaker(recipe)
     tasks = [(category, index) for category in CATEGORIES for index in range(counts.get(category, 0))]
@@ -129,7 +130,7 @@ def make_dataset(
         for task in missing:
             report(maker.make(*task))
     else:
-        _run_pool(recipe, missing, workers, report)
+        run_tasks(missing, partial(_start_maker, recipe), _make, workers=workers, report=report)
     _write_index(out, recipe, maker, counts)
 
 
@@ -166,11 +167,16 @@ def read_index(folder: Path) -> dict:
     try:
         index = json.loads(path.read_text())
     except FileNotFoundError:
-        raise DatasetError(f"{path} is missing; the folder holds no complete data set, run make_dataset on it") from None
+        raise DatasetError(
+            f"{path} is missing; the folder holds no complete data set, run make_dataset on it"
+        ) from None
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}") from error
     if (index.get("schema"), index.get("version")) != (_SCHEMA, _VERSION):
-        raise DatasetError(f"{path}: expected schema {_SCHEMA} version {_VERSION}, got {index.get('schema')} version {index.get('version')}")
+        raise DatasetError(
+            f"{path}: expected schema {_SCHEMA} version {_VERSION}, "
+            f"got {index.get('schema')} version {index.get('version')}"
+        )
     return index
 
 
@@ -180,14 +186,20 @@ def _load_garment(path: Path) -> TrainingGarment:
             arrays = dict(file)
         meta = json.loads(str(arrays.pop("meta")))
     except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path} is missing or damaged ({error}); run make_dataset on the folder again") from error
+        raise DatasetError(
+            f"{path} is missing or damaged ({error}); run make_dataset on the folder again"
+        ) from error
     if meta["version"] != FILE_VERSION:
-        raise DatasetError(f"{path}: expected version {FILE_VERSION}, got {meta['version']}; make the data set again")
+        raise DatasetError(
+            f"{path}: expected version {FILE_VERSION}, got {meta['version']}; make the data set again"
+        )
     fields = TrainingPanel.__dataclass_fields__
     return TrainingGarment(
         name=meta["name"],
         category=meta["category"],
-        panels={side: TrainingPanel(**{name: arrays[f"{side}_{name}"] for name in fields}) for side in PANELS},
+        panels={
+            side: TrainingPanel(**{name: arrays[f"{side}_{name}"] for name in fields}) for side in PANELS
+        },
         rest_vertices=arrays["rest_vertices"],
         anchors=arrays["anchors"],
         parameters=meta["parameters"],
@@ -195,59 +207,17 @@ def _load_garment(path: Path) -> TrainingGarment:
     )
 
 
-def _run_pool(recipe: Recipe, tasks: list[tuple[str, int]], workers: int, report: Callable[[str], None]) -> None:
-    """Make garments in separate processes. A worker that dies loses its own garment at most; it is made again."""
-    remaining = dict.fromkeys(tasks)
-    for _ in range(_POOL_RESTARTS):
-        if not remaining:
-            return
-        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (recipe,)) as pool:
-            try:
-                with _ThreadsPinned():
-                    futures = {pool.submit(_make_in_worker, task): task for task in remaining}
-                for future in as_completed(futures):
-                    report(future.result())
-                    del remaining[futures[future]]
-            except BrokenProcessPool:
-                continue
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-    if remaining:
-        raise DatasetError(f"worker processes died {_POOL_RESTARTS} times with {len(remaining)} garments to go; use fewer workers, or check the memory; finished garments are kept")
+_maker: GarmentMaker | None = None  # of a worker process
 
 
-_worker: GarmentMaker | None = None
+def _start_maker(recipe: Recipe) -> None:
+    global _maker
+    _maker = GarmentMaker(recipe)
 
 
-def _start_worker(recipe: Recipe) -> None:
-    global _worker
-    import torch
-
-    torch.set_num_threads(1)
-    _worker = GarmentMaker(recipe)
-
-
-def _make_in_worker(task: tuple[str, int]) -> str:
-    assert _worker is not None
-    return _worker.make(*task)
-
-
-class _ThreadsPinned:
-    """One thread per child process: BLAS reads these when it starts, and two pools of threads hinder each other."""
-
-    _names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-
-    def __enter__(self) -> None:
-        self._before = {name: os.environ.get(name) for name in self._names}
-        os.environ.update(dict.fromkeys(self._names, "1"))
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+def _make(task: tuple[str, int]) -> str:
+    assert _maker is not None
+    return _maker.make(*task)
 
 
 def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, counts: Mapping[str, int]) -> None:
@@ -266,15 +236,17 @@ def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, counts: Mapping
             "panel_center": maker.panel_center(name).tolist(),
             "panel_scale": category.panel_scale,
             "statistics": _statistics([meta["metrics"] for meta in metas]),
-            "rejections": [dict(garment=m["name"], reason=reason) for m in metas for reason in m["rejections"]],
+            "rejections": [
+                {"garment": m["name"], "reason": reason} for m in metas for reason in m["rejections"]
+            ],
         }
     index = {
         "schema": _SCHEMA, "version": _VERSION, "body": recipe.body, "body_sha256": maker.body_sha256,
         "seed": recipe.seed, "edge_length": recipe.edge_length, "categories": categories,
     }  # fmt: skip
-    partial = out / "dataset.json.partial"
-    partial.write_text(json.dumps(index, indent=1) + "\n")
-    os.replace(partial, out / "dataset.json")
+    draft = out / "dataset.json.partial"
+    draft.write_text(json.dumps(index, indent=1) + "\n")
+    os.replace(draft, out / "dataset.json")
 
 
 def _statistics(metrics: list[dict[str, float]]) -> dict[str, dict[str, float]]:

@@ -92,7 +92,10 @@ class GarmentMaker:
             return False
         expected = self._provenance()
         if meta["version"] != FILE_VERSION or meta["provenance"] != expected:
-            raise DatasetError(f"{path} was made as {meta['provenance']}, version {meta['version']}; expected {expected}, version {FILE_VERSION}; choose another folder")
+            raise DatasetError(
+                f"{path} was made as {meta['provenance']}, version {meta['version']}; "
+                f"expected {expected}, version {FILE_VERSION}; choose another folder"
+            )
         return True
 
     @staticmethod
@@ -123,7 +126,9 @@ class GarmentMaker:
                 break
             rejections.append(fault)
         else:
-            raise DatasetError(f"garment {self.name(category, index)!r}: no good draft in {_ATTEMPTS}: {rejections}")
+            raise DatasetError(
+                f"garment {self.name(category, index)!r}: no good draft in {_ATTEMPTS}: {rejections}"
+            )
         meta = {
             "version": FILE_VERSION, "name": self.name(category, index), "category": category, "index": index,
             "provenance": self._provenance(), "parameters": asdict(parameters), "metrics": rest.metrics,
@@ -131,13 +136,16 @@ class GarmentMaker:
         }  # fmt: skip
         _save(self.path(category, index), pattern, sewn, rest, meta)
         note = f", {len(rejections)} rejected" if rejections else ""
-        return f"{category} {meta['name']}: {len(rest.vertices)} vertices, strain {rest.metrics['strain_mean']:.1%}{note}"
+        size, strain = len(rest.vertices), rest.metrics["strain_mean"]
+        return f"{category} {meta['name']}: {size} vertices, strain {strain:.1%}{note}"
 
     def _parameters(self, category: str, index: int, attempt: int):
         spec = CATEGORIES[category]
         if index < len(spec.presets):
             return list(spec.presets.values())[index]
-        return spec.sample(np.random.default_rng([self.recipe.seed, list(CATEGORIES).index(category), index, attempt]))
+        return spec.sample(
+            np.random.default_rng([self.recipe.seed, list(CATEGORIES).index(category), index, attempt])
+        )
 
     def _try(self, category: str, parameters, attempt: int) -> tuple[Pattern, SewnPattern, RestShape]:
         body = self.rest_body(category)
@@ -152,7 +160,9 @@ class GarmentMaker:
         for key, limit in _LIMITS.items():
             if not rest.metrics[key] <= limit:
                 return f"{key} {rest.metrics[key]:.3g} > {limit:g}"
-        reach = np.abs((sewn.vertex_xy - self.panel_center(category)) / CATEGORIES[category].panel_scale).max()
+        reach = np.abs(
+            (sewn.vertex_xy - self.panel_center(category)) / CATEGORIES[category].panel_scale
+        ).max()
         return None if reach <= _REACH else f"pattern reaches {reach:.3f} > {_REACH} of the panel"
 
     def _rest_body(self, pose: Float[np.ndarray, "24 3"]) -> RestBody:
@@ -165,7 +175,11 @@ class GarmentMaker:
         return self._rest[key]
 
     def _provenance(self) -> dict:
-        return {"seed": self.recipe.seed, "body_sha256": self.body_sha256, "edge_length": self.recipe.edge_length}
+        return {
+            "seed": self.recipe.seed,
+            "body_sha256": self.body_sha256,
+            "edge_length": self.recipe.edge_length,
+        }
 
 
 def _save(path: Path, pattern: Pattern, sewn: SewnPattern, rest: RestShape, meta: dict) -> None:
@@ -179,7 +193,7 @@ def _save(path: Path, pattern: Pattern, sewn: SewnPattern, rest: RestShape, meta
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{os.getpid()}.partial")
     with partial.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # type: ignore[arg-type]
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)

@@ -62,7 +62,9 @@ class RestBody:
         _, node = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
         node = node.reshape(-1, 2)
         n = node.max() + 1
-        _, component = connected_components(coo_array((np.ones(len(node)), node.T), shape=(n, n)), directed=False)
+        _, component = connected_components(
+            coo_array((np.ones(len(node)), node.T), shape=(n, n)), directed=False
+        )
         loop = component[node[:, 0]]
         means = np.array([segments[loop == k].mean(axis=(0, 1)) for k in range(loop.max() + 1)])
         rank = np.argsort(np.argsort(np.linalg.norm(means - origin, axis=1)))
@@ -111,14 +113,14 @@ class Landmarks:
     waist_girth: float
     hip_girth: float
     chest_girth: float
-    arm_x: tuple[float, float, float]
+    arm_x: tuple[float, ...]
     """Upper arm, elbow, wrist."""
-    arm_girth: tuple[float, float, float]
+    arm_girth: tuple[float, ...]
     leg_xy: tuple[tuple[float, float], ...]
     """Middle of the left leg at thigh, knee, ankle."""
     leg_axis: tuple[float, float]
     """Unit direction of the left leg, downwards."""
-    leg_girth: tuple[float, float, float]
+    leg_girth: tuple[float, ...]
     crotch_arc: float
     """From the front of the waist through the legs to its back."""
 
@@ -148,20 +150,22 @@ def _measure(body: RestBody) -> Landmarks:
 
     arm_x = tuple(float(f * widest) for f in (0.32, 0.55, 0.80))
     arm_girth = tuple(
-        body.girth(np.array([x, depth.runs_in_column(x)[-1].mean(), 0.0]), np.array([1.0, 0.0, 0.0])) for x in arm_x
+        body.girth(np.array([x, depth.runs_in_column(x)[-1].mean(), 0.0]), np.array([1.0, 0.0, 0.0]))
+        for x in arm_x
     )
     leg_xy = tuple(_leg_middle(depth, bottom + f * (crotch_y - bottom)) for f in (0.93, 0.52, 0.12))
     axis = np.subtract(leg_xy[2], leg_xy[0])
     axis /= np.linalg.norm(axis)
     leg_girth = tuple(body.girth(np.array([*xy, 0.0]), np.array([*axis, 0.0])) for xy in leg_xy)
-    values = dict(
-        top_y=top, bottom_y=bottom, arm_y=arm_y, armpit_x=trunk[armpit], armpit_y=ys[armpit], crotch_y=crotch_y,
-        waist_x=waist_x, waist_y=waist_y, hip_x=hip_x, hip_y=hip_y, neck_x=neck.min(), neck_y=neck_ys[neck.argmin()],
-        waist_girth=body.level_girth(waist_y), hip_girth=body.level_girth(hip_y),
-        chest_girth=body.level_girth(ys[armpit] - 0.04), crotch_arc=_crotch_arc(body, waist_y),
-    )  # fmt: skip
+    floats = {
+        "top_y": top, "bottom_y": bottom, "arm_y": arm_y, "armpit_x": trunk[armpit], "armpit_y": ys[armpit],
+        "crotch_y": crotch_y, "waist_x": waist_x, "waist_y": waist_y, "hip_x": hip_x, "hip_y": hip_y,
+        "neck_x": neck.min(), "neck_y": neck_ys[neck.argmin()], "waist_girth": body.level_girth(waist_y),
+        "hip_girth": body.level_girth(hip_y), "chest_girth": body.level_girth(ys[armpit] - 0.04),
+        "crotch_arc": _crotch_arc(body, waist_y),
+    }  # fmt: skip
     return Landmarks(
-        **{name: float(value) for name, value in values.items()},
+        **{name: float(value) for name, value in floats.items()},
         arm_x=arm_x, arm_girth=arm_girth, leg_xy=leg_xy, leg_axis=tuple(axis.tolist()), leg_girth=leg_girth,
     )  # fmt: skip
 

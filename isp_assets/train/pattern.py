@@ -5,7 +5,8 @@ back share that plane, so seam curves that are equal in both panels meet point b
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +19,7 @@ from isp_assets.geometry.topology import weld
 from isp_assets.geometry.triangulate import triangulate_panel
 from isp_assets.train.landmarks import Landmarks, RestBody
 
-Curve = Float[np.ndarray, "n 2"]
+Curve = Float[np.ndarray, "_ 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +53,17 @@ class PatternCategory:
     edge_names: Mapping[int, str]
     seam_pairs: tuple[tuple[int, int], ...]
     anchor_labels: tuple[int, ...]
-    presets: Mapping[str, object]
+    presets: Mapping[str, Any]
     """Named garments and their parameters."""
-    sample: Callable[[np.random.Generator], object]
+    sample: Callable[[np.random.Generator], Any]
     """Draws random parameters."""
-    draw: Callable[[RestBody, Landmarks, object], Pattern]
+    draw: Callable[[RestBody, Landmarks, Any], Pattern]
     """Makes the pattern on a body in its rest pose; the landmarks are those of its T-pose."""
     panel_center: Callable[[Landmarks], tuple[float, float]]
     """Centre of the network's coordinates [m], from the landmarks in the rest pose."""
     panel_scale: float
     """Metres per unit of the network's coordinates."""
-    leg_angle: float = field(default=0.0)
+    leg_angle: float = 0.0
     """Outward turn of both legs in the rest pose [rad]."""
 
 
@@ -72,7 +73,7 @@ class SewnPanel:
 
     xy: Float[np.ndarray, "P 2"]
     faces: Int[np.ndarray, "F 3"]
-    """Wound so that the sewn surface faces outwards: the front counter-clockwise in xy, the back clockwise."""
+    """Wound so that the sewn surface faces outwards: the front counter-clockwise in xy, the back not."""
     vertex_index: Int[np.ndarray, " P"]
 
 
@@ -115,10 +116,16 @@ def sew(pattern: Pattern, spacing: float) -> SewnPattern:
     offset = len(points["front"])
     pairs = []
     for front, back in pattern.seam_pairs:
-        ends = [index[side].get(label, np.empty(0, dtype=np.int64)) for side, label in zip(PANELS, (front, back), strict=True)]
+        ends = [
+            index[side].get(label, np.empty(0, dtype=np.int64))
+            for side, label in zip(PANELS, (front, back), strict=True)
+        ]
         xy = [points[side][rows] for side, rows in zip(PANELS, ends, strict=True)]
         if len(ends[0]) != len(ends[1]) or (len(xy[0]) and np.abs(xy[0] - xy[1]).max() > 1e-6):
-            raise GarmentError(f"seam ({front}, {back}): the two sides have different curves ({len(ends[0])} and {len(ends[1])} points)")
+            raise GarmentError(
+                f"seam ({front}, {back}): the two sides have different curves "
+                f"({len(ends[0])} and {len(ends[1])} points)"
+            )
         pairs.append(np.stack([ends[0], offset + ends[1]], axis=1))
     everything = np.concatenate([points[side] for side in PANELS])
     vertex, count = weld(len(everything), np.concatenate(pairs))
@@ -128,7 +135,9 @@ def sew(pattern: Pattern, spacing: float) -> SewnPattern:
     side_of = np.zeros(count, dtype=np.int64)
     for side, sign in zip(PANELS, (1, -1), strict=True):
         side_of[np.setdiff1d(vertex_of[side], vertex_of["back" if side == "front" else "front"])] = sign
-    anchors = [vertex_of[s][index[s][label]] for s in PANELS for label in pattern.anchor_labels if label in index[s]]
+    anchors = [
+        vertex_of[s][index[s][label]] for s in PANELS for label in pattern.anchor_labels if label in index[s]
+    ]
     return SewnPattern(
         panels={side: SewnPanel(points[side], faces[side], vertex_of[side]) for side in PANELS},
         anchors=np.unique(np.concatenate(anchors)) if anchors else np.empty(0, dtype=np.int64),
@@ -181,9 +190,13 @@ def mirrored(curve: Curve) -> Curve:
     return np.asarray(curve)[::-1] * np.array([-1.0, 1.0])
 
 
-def _resample_loops(loops: tuple[Loop, ...], spacing: float) -> tuple[list[Curve], dict[int, Int[np.ndarray, " n"]]]:
+def _resample_loops(
+    loops: tuple[Loop, ...], spacing: float
+) -> tuple[list[Curve], dict[int, Int[np.ndarray, " n"]]]:
     """Loop points, and per label the panel point numbers of its edges, end points included."""
-    result, index, start = [], {}, 0
+    result: list[Curve] = []
+    index: dict[int, list[Int[np.ndarray, " n"]]] = {}
+    start = 0
     for loop in loops:
         curves = [resample(edge.points, spacing) for edge in loop]
         for curve, following in zip(curves, curves[1:] + curves[:1], strict=True):
@@ -204,5 +217,5 @@ def _twins(vertex_xy: Float[np.ndarray, "V 2"], side: Int[np.ndarray, " V"]) -> 
     front, back = np.flatnonzero(side > 0), np.flatnonzero(side < 0)
     if len(front) == 0 or len(back) == 0:
         return np.empty((0, 2), dtype=np.int64)
-    distance, nearest = cKDTree(vertex_xy[back]).query(vertex_xy[front])
+    distance, nearest = cKDTree(vertex_xy[back], balanced_tree=False).query(vertex_xy[front])
     return np.stack([front, back[nearest]], axis=1)[distance < 1e-4]

@@ -42,8 +42,8 @@ def sample_skirt(rng: np.random.Generator) -> SkirtParameters:
     """Draw random parameters."""
     u = rng.uniform
     return SkirtParameters(
-        length=u(0.02, 1.0), flare=u(-0.03, 1.0), waist=u(0.99, 1.06), rise=u(-0.02, 0.05), hip_ease=u(0.05, 0.16),
-        hem_curve=u(0.2, 1.0),
+        length=u(0.02, 1.0), flare=u(-0.03, 1.0), waist=u(0.99, 1.06), rise=u(-0.02, 0.05), hip_ease=u(0.05,
+        0.16), hem_curve=u(0.2, 1.0),
     )  # fmt: skip
 
 

@@ -6,7 +6,16 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from isp_assets.train.landmarks import Landmarks, RestBody
-from isp_assets.train.pattern import Curve, Loop, Pattern, PatternCategory, PatternEdge, bezier, mirrored, smooth_curve
+from isp_assets.train.pattern import (
+    Curve,
+    Loop,
+    Pattern,
+    PatternCategory,
+    PatternEdge,
+    bezier,
+    mirrored,
+    smooth_curve,
+)
 
 EDGE_NAMES = {
     1: "side_right", 2: "under_sleeve_right", 3: "cuff_right", 4: "over_sleeve_right", 5: "neckline",
@@ -53,25 +62,35 @@ class TopParameters:
 
 PRESETS = {
     "tank_top": TopParameters(
-        sleeve=0.0, ease=0.07, hem=1.0, length=0.56, shaping=0.02, strap=0.55, neck_width=1.75, neck_front=0.13,
-        neck_back=0.05, shoulder_ease=0.008, armhole=0.02,
+        sleeve=0.0, ease=0.07, hem=1.0, length=0.56, shaping=0.02, strap=0.55, neck_width=1.75,
+        neck_front=0.13, neck_back=0.05, shoulder_ease=0.008, armhole=0.02,
     ),
     "tee": TopParameters(),
-    "long_sleeved_shirt": TopParameters(sleeve=0.97, ease=0.15, length=0.68, sleeve_ease=0.32, cuff=1.1, neck_width=1.35, neck_front=0.07),
-    "crop_top": TopParameters(sleeve=0.15, ease=0.08, hem=0.97, length=0.06, sleeve_ease=0.3, neck_width=1.8, neck_front=0.10, neck_back=0.03),
-    "oversized_tee": TopParameters(ease=0.42, hem=1.0, length=0.88, sleeve=0.42, sleeve_ease=0.75, cuff=1.2, armhole=0.05, shoulder_ease=0.02),
-    "v_neck_shirt": TopParameters(sleeve=0.45, ease=0.13, length=0.62, shaping=0.01, neck_width=1.5, neck_front=0.17, vee=1.0),
+    "long_sleeved_shirt": TopParameters(
+        sleeve=0.97, ease=0.15, length=0.68, sleeve_ease=0.32, cuff=1.1, neck_width=1.35, neck_front=0.07,
+    ),
+    "crop_top": TopParameters(
+        sleeve=0.15, ease=0.08, hem=0.97, length=0.06, sleeve_ease=0.3, neck_width=1.8, neck_front=0.10,
+        neck_back=0.03,
+    ),
+    "oversized_tee": TopParameters(
+        ease=0.42, hem=1.0, length=0.88, sleeve=0.42, sleeve_ease=0.75, cuff=1.2, armhole=0.05,
+        shoulder_ease=0.02,
+    ),
+    "v_neck_shirt": TopParameters(
+        sleeve=0.45, ease=0.13, length=0.62, shaping=0.01, neck_width=1.5, neck_front=0.17, vee=1.0,
+    ),
     "open_jacket": TopParameters(
-        sleeve=1.0, ease=0.32, hem=1.03, length=0.70, sleeve_ease=0.62, cuff=1.2, neck_width=1.6, neck_front=0.11,
-        shoulder_ease=0.024, armhole=0.045, open=True, gap=0.02,
+        sleeve=1.0, ease=0.32, hem=1.03, length=0.70, sleeve_ease=0.62, cuff=1.2, neck_width=1.6,
+        neck_front=0.11, shoulder_ease=0.024, armhole=0.045, open=True, gap=0.02,
     ),
     "open_vest": TopParameters(
-        sleeve=0.0, ease=0.26, length=0.58, strap=0.66, neck_width=1.6, neck_front=0.16, vee=0.8, shoulder_ease=0.02,
-        armhole=0.055, open=True, gap=0.03,
+        sleeve=0.0, ease=0.26, length=0.58, strap=0.66, neck_width=1.6, neck_front=0.16, vee=0.8,
+        shoulder_ease=0.02, armhole=0.055, open=True, gap=0.03,
     ),
     "long_cardigan": TopParameters(
-        sleeve=0.95, ease=0.28, hem=1.12, length=1.45, sleeve_ease=0.5, cuff=1.15, neck_width=1.6, neck_front=0.16,
-        vee=0.7, shoulder_ease=0.02, armhole=0.035, open=True, gap=0.04,
+        sleeve=0.95, ease=0.28, hem=1.12, length=1.45, sleeve_ease=0.5, cuff=1.15, neck_width=1.6,
+        neck_front=0.16, vee=0.7, shoulder_ease=0.02, armhole=0.035, open=True, gap=0.04,
     ),
 }  # fmt: skip
 
@@ -81,7 +100,8 @@ def sample_top(rng: np.random.Generator) -> TopParameters:
     u = rng.uniform
     return TopParameters(
         ease=u(0.06, 0.42), hem=u(0.95, 1.20), length=u(0.0, 1.15), shaping=u(0.0, 0.02),
-        sleeve=0.0 if u() < 0.18 else u(0.12, 1.0), sleeve_ease=u(0.2, 0.75), cuff=u(0.95, 1.35), strap=u(0.52, 0.68),
+        sleeve=0.0 if u() < 0.18 else u(0.12, 1.0), sleeve_ease=u(0.2, 0.75), cuff=u(0.95, 1.35),
+        strap=u(0.52, 0.68),
         neck_width=u(1.25, 2.0), neck_front=u(0.05, 0.20), neck_back=u(0.005, 0.05), vee=u(0.0, 1.0),
         shoulder_ease=u(0.008, 0.03), armhole=u(0.01, 0.05), open=bool(u() < 0.28), gap=u(0.0, 0.05),
     )  # fmt: skip
@@ -202,6 +222,6 @@ def _open(half: Loop, neck: Curve, gap: float) -> tuple[Loop, Loop]:
 
 
 TOP = PatternCategory(
-    name="top", edge_names=EDGE_NAMES, seam_pairs=_SEAMS, anchor_labels=(), presets=PRESETS, sample=sample_top,
-    draw=draw_top, panel_center=lambda lm: (0.0, lm.arm_y - 0.32), panel_scale=0.80,
+    name="top", edge_names=EDGE_NAMES, seam_pairs=_SEAMS, anchor_labels=(), presets=PRESETS,
+    sample=sample_top, draw=draw_top, panel_center=lambda lm: (0.0, lm.arm_y - 0.32), panel_scale=0.80,
 )  # fmt: skip

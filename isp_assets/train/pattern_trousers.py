@@ -35,10 +35,16 @@ class TrouserParameters:
 
 PRESETS = {
     "trousers": TrouserParameters(),
-    "slim_trousers": TrouserParameters(length=0.98, hip_ease=0.065, thigh_ease=0.08, hem_ease=0.16, drop=0.035),
-    "wide_trousers": TrouserParameters(length=0.96, hip_ease=0.14, thigh_ease=0.28, hem_ease=1.05, drop=0.08, rise=0.02),
+    "slim_trousers": TrouserParameters(
+        length=0.98, hip_ease=0.065, thigh_ease=0.08, hem_ease=0.16, drop=0.035
+    ),
+    "wide_trousers": TrouserParameters(
+        length=0.96, hip_ease=0.14, thigh_ease=0.28, hem_ease=1.05, drop=0.08, rise=0.02
+    ),
     "shorts": TrouserParameters(length=0.16, hip_ease=0.11, thigh_ease=0.20, hem_ease=0.5, drop=0.06),
-    "bermuda_shorts": TrouserParameters(length=0.42, hip_ease=0.10, thigh_ease=0.17, hem_ease=0.55, drop=0.05),
+    "bermuda_shorts": TrouserParameters(
+        length=0.42, hip_ease=0.10, thigh_ease=0.17, hem_ease=0.55, drop=0.05
+    ),
 }
 
 
@@ -46,8 +52,8 @@ def sample_trousers(rng: np.random.Generator) -> TrouserParameters:
     """Draw random parameters."""
     u = rng.uniform
     return TrouserParameters(
-        length=u(0.10, 1.0), waist=u(0.99, 1.06), rise=u(-0.04, 0.03), hip_ease=u(0.06, 0.20), thigh_ease=u(0.07, 0.32),
-        hem_ease=u(0.12, 0.9), drop=u(0.03, 0.12),
+        length=u(0.10, 1.0), waist=u(0.99, 1.06), rise=u(-0.04, 0.03), hip_ease=u(0.06, 0.20),
+        thigh_ease=u(0.07, 0.32), hem_ease=u(0.12, 0.9), drop=u(0.03, 0.12),
     )  # fmt: skip
 
 
@@ -103,6 +109,6 @@ def _inseam(inner: Curve, crotch_y: float) -> Curve:
 
 TROUSERS = PatternCategory(
     name="trousers", edge_names=EDGE_NAMES, seam_pairs=_SEAMS, anchor_labels=_ANCHORS, presets=PRESETS,
-    sample=sample_trousers, draw=draw_trousers, panel_center=lambda lm: (0.0, lm.waist_y - 0.53), panel_scale=0.65,
-    leg_angle=float(np.deg2rad(18)),
+    sample=sample_trousers, draw=draw_trousers, panel_center=lambda lm: (0.0, lm.waist_y - 0.53),
+    panel_scale=0.65, leg_angle=float(np.deg2rad(18)),
 )  # fmt: skip

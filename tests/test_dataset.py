@@ -1,0 +1,159 @@
+"""Data sets: what is stored, resuming, independence of the number of workers, bad files."""
+
+import json
+
+import numpy as np
+import pytest
+from rest_bodies import maker
+
+from isp_assets.conventions import PANELS
+from isp_assets.errors import DatasetError
+from isp_assets.train import garment_maker
+from isp_assets.train.dataset import load_dataset, make_dataset
+from isp_assets.train.garment_maker import CATEGORIES, GarmentMaker
+
+pytest.importorskip("numba")
+pytest.importorskip("ipctk")
+
+EDGE = 0.04  # coarse, for speed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("data")
+    make_dataset(out, counts={"top": 1, "skirt": 2}, seed=3, workers=1, edge_length=EDGE)
+    return out
+
+
+def contents(folder):
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
+
+
+def test_a_category_comes_back_whole(folder):
+    data = load_dataset(folder, "skirt")
+    assert [g.name for g in data.garments] == ["mini_skirt", "pencil_skirt"]
+    assert data.edge_names == CATEGORIES["skirt"].edge_names
+    assert data.seam_pairs == ((1, 1), (3, 3))
+    assert data.anchor_labels == (2,)
+    assert data.body_sha256 == maker().body_sha256
+    assert data.rest_pose.shape == (24, 3)
+    for garment in data.garments:
+        used = np.concatenate([garment.panels[side].vertex_index for side in PANELS])
+        assert np.array_equal(np.unique(used), np.arange(len(garment.rest_vertices)))
+        assert len(garment.anchors) > 10
+        assert garment.metrics["self_intersects"] == 0
+        for side, winding in zip(PANELS, (1, -1), strict=True):
+            panel = garment.panels[side]
+            a, b, c = (panel.xy[panel.faces[:, k]] for k in range(3))
+            u, v = b - a, c - a
+            assert (winding * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) > 0).all()
+            network = (panel.xy - data.panel_center) / data.panel_scale
+            assert np.abs(network).max() <= 0.95
+            assert set(panel.outline_label.tolist()) == {1, 2, 3, 4}
+            gaps = np.linalg.norm(panel.outline_xy - np.roll(panel.outline_xy, -1, axis=0), axis=1)
+            assert gaps.max() < 0.0065
+
+
+def test_the_index_counts_and_summarises(folder):
+    index = json.loads((folder / "dataset.json").read_text())
+    assert index["schema"] == "isp-assets/dataset"
+    assert index["seed"] == 3
+    skirts = index["categories"]["skirt"]
+    assert skirts["files"] == ["0000_mini_skirt.npz", "0001_pencil_skirt.npz"]
+    assert isinstance(skirts["rejections"], list)
+    strain = skirts["statistics"]["strain_mean"]
+    assert strain["min"] <= strain["median"] <= strain["max"]
+
+
+def test_a_cut_off_run_is_completed_with_the_same_bytes(folder):
+    before = contents(folder)
+    (folder / "dataset.json").unlink()
+    (folder / "skirt/0000_mini_skirt.npz").unlink()
+    damaged = folder / "skirt/0001_pencil_skirt.npz"
+    damaged.write_bytes(damaged.read_bytes()[:5000])
+    seen = []
+    make_dataset(
+        folder, counts={"top": 1, "skirt": 2}, seed=3, workers=1, edge_length=EDGE,
+        progress=lambda done, total, message: seen.append((done, total, message)),
+    )  # fmt: skip
+    assert [(done, total) for done, total, _ in seen] == [(2, 3), (3, 3)]  # the top was kept
+    assert contents(folder) == before
+
+
+def test_garments_of_another_recipe_are_not_touched(folder):
+    before = contents(folder)
+    with pytest.raises(DatasetError, match="choose another folder"):
+        make_dataset(folder, counts={"top": 1}, seed=4, workers=1, edge_length=EDGE)
+    assert contents(folder) == before
+
+
+def test_random_garments_depend_on_seed_index_and_attempt_alone():
+    first = maker()._parameters("top", 12, 0)
+    assert first == maker()._parameters("top", 12, 0)
+    assert first != maker()._parameters("top", 13, 0)
+    assert first != maker()._parameters("top", 12, 1)
+    assert (
+        maker()._parameters("top", 0, 0)
+        == maker()._parameters("top", 0, 1)
+        == CATEGORIES["top"].presets["tank_top"]
+    )
+    assert maker().name("trousers", 9) == "trousers_0009"
+
+
+def test_bad_drafts_are_drawn_again_and_counted(tmp_path, monkeypatch):
+    faults = iter(["self_intersects 1 > 0.5", "residual 9 > 2", None])
+    monkeypatch.setattr(GarmentMaker, "_fault", lambda *_: next(faults))
+    counts = {"skirt": 1}
+    make_dataset(tmp_path, counts=counts, seed=0, workers=1, edge_length=0.06)
+    index = json.loads((tmp_path / "dataset.json").read_text())
+    assert [r["reason"] for r in index["categories"]["skirt"]["rejections"]] == [
+        "self_intersects 1 > 0.5",
+        "residual 9 > 2",
+    ]
+
+
+def test_no_good_draft_is_an_error_that_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(garment_maker, "_ATTEMPTS", 1)
+    monkeypatch.setattr(garment_maker, "_LIMITS", {"strain_max": -1.0})
+    with pytest.raises(DatasetError, match=r"'mini_skirt': no good draft in 1.*strain_max"):
+        make_dataset(tmp_path, counts={"skirt": 1}, workers=1, edge_length=0.06)
+
+
+@pytest.mark.parametrize("counts", [{}, {"hat": 3}, {"top": 0}])
+def test_bad_counts_are_named(tmp_path, counts):
+    with pytest.raises(DatasetError, match="expected counts"):
+        make_dataset(tmp_path, counts=counts)
+
+
+def test_bad_files_are_named(tmp_path, folder):
+    with pytest.raises(DatasetError, match="holds no complete data set"):
+        load_dataset(tmp_path, "top")
+    with pytest.raises(DatasetError, match="no category 'trousers'"):
+        load_dataset(folder, "trousers")
+    (tmp_path / "dataset.json").write_text("{")
+    with pytest.raises(DatasetError, match="damaged"):
+        load_dataset(tmp_path, "top")
+    (tmp_path / "dataset.json").write_text('{"schema": "isp-assets/dataset", "version": 99}')
+    with pytest.raises(DatasetError, match="expected schema isp-assets/dataset version 1, got"):
+        load_dataset(tmp_path, "top")
+    index = json.loads((folder / "dataset.json").read_text())
+    (tmp_path / "dataset.json").write_text(json.dumps(index))
+    with pytest.raises(DatasetError, match=r"0000_tank_top\.npz is missing or damaged"):
+        load_dataset(tmp_path, "top")
+
+
+def test_pickled_arrays_are_never_read(tmp_path, folder):
+    index = json.loads((folder / "dataset.json").read_text())
+    (tmp_path / "dataset.json").write_text(json.dumps(index))
+    (tmp_path / "top").mkdir()
+    np.savez(tmp_path / "top/0000_tank_top.npz", meta=np.array({"a": 1}, dtype=object))
+    with pytest.raises(DatasetError, match="allow_pickle"):
+        load_dataset(tmp_path, "top")
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_same_garments(tmp_path, folder):
+    make_dataset(tmp_path, counts={"top": 1, "skirt": 2}, seed=3, workers=2, edge_length=EDGE)
+    assert contents(tmp_path) == contents(folder)
