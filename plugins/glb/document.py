@@ -90,8 +90,12 @@ def _add_mesh(file: GlbFile, part: Part, targets: list[dict[str, int]], frames: 
         attributes["TEXCOORD_0"] = file.array(flipped, target=ARRAY_BUFFER)
     index_type = np.uint16 if len(part.position) < 65535 else np.uint32
     indices = file.array(part.faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
-    primitive = {"attributes": attributes, "indices": indices, "material": _add_material(file, part)}
-    mesh = {"name": part.name, "primitives": [primitive]}
+    primitive: dict[str, object] = {
+        "attributes": attributes,
+        "indices": indices,
+        "material": _add_material(file, part),
+    }
+    mesh: dict[str, object] = {"name": part.name, "primitives": [primitive]}
     if targets:
         primitive["targets"] = targets
         mesh["weights"] = [0.0] * len(targets)
@@ -123,7 +127,9 @@ def _add_animation(file: GlbFile, scene: Scene, nodes: list[int], scales: list[l
     """Frame k plays at ``(k - start) / fps`` seconds: full weight there, falling linearly."""
     frames = np.array(list(scene.frames))
     times = file.array(((frames - frames[0]) / scene.fps).astype(np.float32), bounds=True)
-    samplers, channels, written = [], [], {}
+    samplers: list[dict[str, object]] = []
+    channels: list[dict[str, object]] = []
+    written: dict[tuple[float, ...], int] = {}
     for node, weights in zip(nodes, scales, strict=True):
         key = tuple(weights)
         if key not in written:

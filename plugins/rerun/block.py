@@ -24,7 +24,7 @@ class Block:
         """A copy of a chunk, its stage times shared evenly among its frames."""
         count = len(chunk.frames)
         times = {f"{stage}/ms_per_frame": 1e3 * s / count for stage, s in chunk.times.seconds.items()}
-        metrics = chunk.metrics or ({},) * count
+        metrics: Sequence[dict[str, float]] = chunk.metrics or [{}] * count
         meshes = tuple(np.array(vertices, np.float32) for vertices in (chunk.body, *chunk.layers))
         return cls(chunk.frames.copy(), meshes, tuple({**figures, **times} for figures in metrics))
 

@@ -54,7 +54,10 @@ class SheetWriter:
 
     def __init__(self, style: SheetStyle | None = None) -> None:
         self._style = style or SheetStyle()
-        self.abort()
+        self._path = Path()
+        self._scene: Scene | None = None
+        self._wanted: set[int] = set()
+        self._kept: list[_Frame] = []
 
     def begin(self, path: Path, scene: Scene) -> None:
         """Choose the frames to keep."""
@@ -65,13 +68,20 @@ class SheetWriter:
         self._wanted = {numbers[k] for k in chosen}
 
     def add(self, chunk: FrameChunk) -> None:
-        """Keep the frames of this chunk that the sheet shows."""
+        """Keep the frames of this chunk that the sheet shows.
+
+        Raises:
+            PluginError: If one of them has NaN or infinite positions.
+        """
         if self._scene is None:
             raise PluginError("sheet: add was called before begin")
         for index, number in enumerate(chunk.frames.tolist()):
             if number in self._wanted:
                 layers = tuple(points[index].copy() for points in chunk.layers)
-                self._kept.append(_Frame(number, chunk.body[index].copy(), layers))
+                frame = _Frame(number, chunk.body[index].copy(), layers)
+                if not np.isfinite(frame.points).all():
+                    raise PluginError(f"sheet: {self._path}: frame {number} has NaN or infinite positions")
+                self._kept.append(frame)
 
     def finish(self) -> None:
         """Draw the sheet and publish it.
@@ -93,10 +103,7 @@ class SheetWriter:
 
     def abort(self) -> None:
         """Forget everything; nothing is on the disk before ``finish``."""
-        self._path = Path()
-        self._scene: Scene | None = None
-        self._wanted: set[int] = set()
-        self._kept: list[_Frame] = []
+        self._scene, self._wanted, self._kept = None, set(), []
 
 
 def _draw(scene: Scene, frames: list[_Frame], style: SheetStyle) -> Image.Image:

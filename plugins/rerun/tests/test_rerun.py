@@ -7,6 +7,7 @@ import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +28,8 @@ class Recording:
     def __init__(self, path: Path) -> None:
         reader = chunk_api.RrdReader(path)
         self.recordings, self.blueprints = reader.recordings(), reader.blueprints()
-        self.static: dict[tuple[str, str], object] = {}
-        self.moving: dict[tuple[str, str], dict[int, object]] = defaultdict(dict)
+        self.static: dict[tuple[str, str], Any] = {}
+        self.moving: dict[tuple[str, str], dict[int, Any]] = defaultdict(dict)
         self.seconds: dict[int, float] = {}
         self.block_sizes: dict[str, list[int]] = defaultdict(list)
         for chunk in reader.stream():
@@ -186,6 +187,7 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch):
 _FULL_DISK = """
 import sys, resource, signal
 from pathlib import Path
+from typing import Any
 from isp_assets.errors import PluginError
 from isp_assets.plugin_conformance import write_shot
 from isp_assets.synthetic import synthetic_shot

@@ -49,6 +49,16 @@ def test_shot_cut_short_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_broken_positions_are_refused(tmp_path):
+    shot = synthetic_shot()
+    chunk = next(iter(shot.chunks(2)))
+    chunk.layers[0][0, 0, 0] = np.nan
+    writer = SheetWriter()
+    writer.begin(tmp_path / "shot.png", shot.scene)
+    with pytest.raises(PluginError, match="frame 1001 has NaN"):
+        writer.add(chunk)
+
+
 def test_disk_error_leaves_no_file(tmp_path, monkeypatch):
     def broken(source: Path, target: Path) -> None:
         raise OSError(28, "No space left on device")
