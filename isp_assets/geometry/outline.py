@@ -21,7 +21,7 @@ from isp_assets.errors import GeometryError
 
 _COARSE_CELLS = 16
 """Cells across the square on the first grid."""
-_LIPSCHITZ = 1.5
+_LIPSCHITZ = 1.2
 """Bound on the slope of the field: 1 for an exact distance, more for a learnt one."""
 _SPECK = 0.02
 """Pieces and holes smaller than this share of the largest piece are noise of the field."""
