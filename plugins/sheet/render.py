@@ -12,9 +12,10 @@ from jaxtyping import Float, Int, UInt8
 
 from isp_assets.errors import PluginError
 from isp_assets.frames import Layer
+from isp_assets_plugins.normals import VertexNormals
 
 from .camera import Camera, View
-from .shading import SurfacePoints, ambient_occlusion, shade, vertex_normals
+from .shading import SurfacePoints, ambient_occlusion, shade
 from .texture import MipTexture, linear_from_srgb, srgb_from_linear
 from .tracer import Hits, Tracer
 
@@ -97,7 +98,7 @@ class RenderScene:
         self._mesh_of_face = np.repeat(np.arange(len(meshes)), [len(m.faces) for m in meshes])
         self._first_face = np.cumsum([0] + [len(m.faces) for m in meshes])
         self._tracer = Tracer(self._vertices, self._faces)
-        self._normals = vertex_normals(self._vertices, self._faces)
+        self._normals = VertexNormals(self._faces, len(self._vertices))(self._vertices)
         self._openness = ambient_occlusion(self._tracer, self._vertices, self._normals)
         self._textures = [None if m.texture is None else MipTexture(m.texture) for m in meshes]
         self._texel_sizes = [_texel_size(mesh) for mesh in meshes]

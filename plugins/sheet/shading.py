@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from .tracer import Tracer
 
@@ -27,17 +27,6 @@ class SurfacePoints:
     """Share of the sky that the outer side sees, 0..1."""
     albedo: Float[np.ndarray, "n 3"]
     """Linear."""
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Unit normals, area weighted; zero for a vertex without faces."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    spread = np.repeat(normals, 3, axis=0)
-    total = np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in spread.T], 1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
 
 
 def ambient_occlusion(

@@ -14,7 +14,6 @@ from isp_assets.plugin_conformance import check_writer, write_shot
 from isp_assets.synthetic import synthetic_shot
 from isp_assets_plugins.sheet import Camera, RenderMesh, SheetStyle, SheetWriter, render_view
 from isp_assets_plugins.sheet.camera import View
-from isp_assets_plugins.sheet.shading import vertex_normals
 from isp_assets_plugins.sheet.texture import MipTexture, linear_from_srgb, srgb_from_linear
 from isp_assets_plugins.sheet.tracer import Tracer
 from isp_assets_plugins.sheet.writer import _Frame, _heading
@@ -158,11 +157,6 @@ def test_fine_checks_fade_to_their_mean():
     centres = np.stack([column + 0.5, 63.5 - row], 1) / 64
     exact = linear_from_srgb(checks[row, column] / 255)[:, None].repeat(3, 1)
     np.testing.assert_allclose(texture.sample(centres, 1.0), exact, atol=1e-6)
-
-
-def test_vertex_normals_of_a_square():
-    vertices, faces = _square(0.0)
-    np.testing.assert_allclose(vertex_normals(vertices, faces), np.tile([0, 0, 1.0], (4, 1)))
 
 
 def test_texture_without_coordinates_is_refused():
