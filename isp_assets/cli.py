@@ -52,7 +52,7 @@ WriteOption = Annotated[
 DeviceOption = Annotated[Device, typer.Option("--device", help="Where the networks run.")]
 StepsOption = Annotated[
     str | None,
-    typer.Option("--steps", help="Rungs to run, of skin,displace,layering,project (for comparisons)."),
+    typer.Option("--steps", help="Rungs to run, of skin,displace,tuck,layering,project (for comparisons)."),
 ]
 
 

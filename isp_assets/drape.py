@@ -1,9 +1,10 @@
 """Drape an outfit over a shot: the ladder of solvers, chunk by chunk.
 
-Rungs, in order: ``skin`` (Eqs. 6-7), ``displace`` (D_s), ``layering`` (D_m, Eqs. 9-12),
-``project`` (leaves no contact). Each layer is corrected once against everything
-beneath it, so the cost grows linearly with the number of layers. A rung that a
-frame does not need is skipped there, and the chunk says what ran.
+Rungs, in order: ``skin`` (Eqs. 6-7), ``displace`` (D_s), ``tuck`` (a wide inner layer gives
+way to the ones worn over it), ``layering`` (D_m, Eqs. 9-12), ``project`` (leaves no contact).
+Each layer is corrected once against everything beneath it, so the cost of layering grows
+linearly with the number of layers. A rung that a frame does not need is skipped there, and
+the chunk says what ran.
 
 Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
 Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
@@ -29,12 +30,13 @@ from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions, project
+from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.outfit import Outfit
 from isp_assets.shot import DEFAULT_RESOLUTION, Shot
 from isp_assets.skinning import skin_garment
 
-STEPS = ("skin", "displace", "layering", "project")
+STEPS = ("skin", "displace", "tuck", "layering", "project")
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,9 @@ class _Draper:
         state.beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
         margin = self.options.body_margin
         state.obstacles = [[Obstacle(self.body_collision, v, margin=margin)] for v in skin]
-        layers = tuple(self._layer(index, worn, posed, state) for index, worn in enumerate(self.worn))
+        alone = [self._drape_alone(worn, posed, state) for worn in self.worn]
+        self._tuck(alone, state)
+        layers = tuple(self._settle(index, vertices, posed, state) for index, vertices in enumerate(alone))
         frames = motion.frames[rows]
         self._check_finite(layers, frames)
         return FrameChunk(
@@ -138,21 +142,50 @@ class _Draper:
             steps=tuple(tuple(tuple(layer[t]) for layer in state.steps) for t in range(len(frames))),
         )
 
-    def _layer(
-        self, index: int, worn: WornGarment, posed: PosedBody, state: "_ChunkState"
-    ) -> Float[np.ndarray, "T V 3"]:
-        steps, keep = self.options.steps, self.options.keep_stages
+    def _drape_alone(
+        self, worn: WornGarment, posed: PosedBody, state: "_ChunkState"
+    ) -> Float[Tensor, "T V 3"]:
+        """One garment as if it were the only one."""
         ran: list[list[str]] = [["skin"] for _ in range(len(posed.vertices))]
         with state.timed("skin"):
             vertices, rotations = skin_garment(worn.skin, posed, self.betas)
-        state.keep("skin", vertices, keep)
-        if "displace" in steps and worn.displacement is not None and worn.field is not None:
+        state.keep("skin", vertices, self.options.keep_stages)
+        if "displace" in self.options.steps and worn.displacement is not None and worn.field is not None:
             with state.timed("displace"):
                 features = drape_features(posed, self.betas, worn.code, num_betas=worn.field.config.num_betas)
                 moved = displacements(worn.displacement, worn.field, features)
                 vertices = displace(vertices, rotations, moved)
             _note(ran, "displace")
-        state.keep("displace", vertices, keep)
+        state.keep("displace", vertices, self.options.keep_stages)
+        state.steps.append(ran)
+        return vertices
+
+    def _tuck(self, layers: list[Float[Tensor, "T _ 3"]], state: "_ChunkState") -> None:
+        """Let wide inner layers give way to the layers over them; replaces entries of ``layers``."""
+        if "tuck" in self.options.steps and len(layers) > 1:
+            with state.timed("tuck"):
+                layers[:] = [vertices.clone() for vertices in layers]
+                for t in range(len(layers[0])):
+                    self._tuck_frame(layers, t, state)
+        for vertices in layers:
+            state.keep("tuck", vertices, self.options.keep_stages)
+
+    def _tuck_frame(self, layers: list[Float[Tensor, "T _ 3"]], t: int, state: "_ChunkState") -> None:
+        covers: list[Obstacle] = []
+        for index in reversed(range(len(layers))):
+            worn, before = self.worn[index], layers[index][t].cpu().numpy().astype(np.float64)
+            after = tuck(before, worn.collision, covers)
+            if after is not before:
+                layers[index][t] = torch.as_tensor(after).to(layers[index])
+                state.steps[index][t].append("tuck")
+            covers.append(Obstacle(worn.collision, after, margin=0.0))
+
+    def _settle(
+        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
+    ) -> Float[np.ndarray, "T V 3"]:
+        """Correct one garment against everything beneath it, and add it to what lies beneath."""
+        worn, ran = self.worn[index], state.steps[index]
+        steps, keep = self.options.steps, self.options.keep_stages
         if "layering" in steps and worn.layering is not None and index > 0:
             with state.timed("layering"):
                 vertices, touched = correct_layer(
@@ -165,7 +198,6 @@ class _Draper:
         if "project" in steps:
             with state.timed("project"):
                 result, tight = self._project(worn, result, state, ran)
-        state.steps.append(ran)
         outside = torch.as_tensor(result, device=vertices.device)
         state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
         for t, obstacles in enumerate(state.obstacles):

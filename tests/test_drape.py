@@ -111,7 +111,7 @@ def test_projection_moves_nothing_far(outfit: Outfit, shot: Shot) -> None:
 
 
 def test_wrong_options_and_body(outfit: Outfit, shot: Shot) -> None:
-    with pytest.raises(DrapeError, match="steps must be some of skin, displace, layering, project"):
+    with pytest.raises(DrapeError, match="steps must be some of skin, displace, tuck, layering, project"):
         DrapeOptions(steps=("displace",))
     with pytest.raises(DrapeError, match="chunk must be at least 1"):
         DrapeOptions(chunk=0)

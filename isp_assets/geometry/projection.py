@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
+from isp_assets.geometry.spread import keep_larger, spread
 
 BODY_MARGIN = 0.003
 """Clearance to leave over the body [m]."""
@@ -31,7 +31,6 @@ LAYER_MARGIN = 0.0025
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
 _WATCHED = 0.02  # vertices this near [m] at the start are looked at again in every round
-_SPREAD_DECAY = 0.9  # part of a lift that the next ring of neighbours follows
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _FINISH_STEP = 0.004  # largest lift [m] of one such correction
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
@@ -150,10 +149,10 @@ class _Projector:
             last = done == options.rounds - 1
             lift = self._lift_vertices(foreign=not last)
             if done > 0:
-                _keep_larger(lift, self._lift_triangles(self.position + lift))
+                keep_larger(lift, self._lift_triangles(self.position + lift))
             if np.abs(lift).max(initial=0) < options.tolerance:
                 return done
-            step = _spread(lift, self.mesh.neighbour_average, 0 if last else options.spread)
+            step = spread(lift, self.mesh.neighbour_average, 0 if last else options.spread)
             self._move(step)
         return options.rounds
 
@@ -166,7 +165,7 @@ class _Projector:
                 pairs = self._crossings(neighbour)
                 crossings += len(pairs)
                 if len(pairs) and attempt < self.options.finish:
-                    _keep_larger(lift, self._part(neighbour.obstacle, pairs))
+                    keep_larger(lift, self._part(neighbour.obstacle, pairs))
             if not lift.any():
                 break
             self._move(lift)
@@ -191,7 +190,7 @@ class _Projector:
             points, parts = self.position[index], self.mesh.parts[index]
             margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
             found = obstacle.contacts(points, parts, within=_WATCHED)
-            _keep_larger(own, _shortest_way(points, found, margin, self.options.reach), index)
+            keep_larger(own, _shortest_way(points, found, margin, self.options.reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
             if foreign:
@@ -208,7 +207,7 @@ class _Projector:
         if watched is None:
             neighbour.watched_foreign = np.abs(found.height) < _WATCHED
         margin = np.full(len(index), obstacle.margin)
-        _keep_larger(lift, _shortest_way(points, found, margin, self.options.foreign_reach), index)
+        keep_larger(lift, _shortest_way(points, found, margin, self.options.foreign_reach), index)
 
     def _lift_triangles(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
         """Lift the corners of triangles over obstacle vertices that poke through them."""
@@ -231,7 +230,7 @@ class _Projector:
             hit, corner, weights = hit[free], corner[free], found.weights[hit[free]]
             share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
             push = ((found.height[hit] + gap)[:, None] * share)[..., None] * found.normal[hit][:, None]
-            _keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
+            keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
         return lift
 
     def _crossings(self, neighbour: _Neighbour) -> Int[np.ndarray, "n 2"]:
@@ -254,7 +253,7 @@ class _Projector:
         faces, beneath = self.mesh.topology.faces[pairs[:, 0]], obstacle.mesh.topology.faces[pairs[:, 1]]
         mine, theirs = unit_face_normals(self.position, faces), obstacle.face_normals[pairs[:, 1]]
         alike = np.einsum("pc,pc->p", mine, theirs)
-        # Where the other triangle stands across the garment (a fold), its plane leads nowhere: take one's own.
+        # Where the other triangle stands across the garment (a fold), its plane leads nowhere.
         plane = np.where((alike > _SAME_SIDE)[:, None], theirs, mine)
         top = np.einsum("pkc,pc->pk", obstacle.vertices[beneath], plane).max(1)
         height = np.einsum("pkc,pc->pk", self.position[faces], plane)
@@ -274,17 +273,6 @@ def _shortest_way(
     return np.where(touching[:, None], (margin - found.height).clip(0, 1)[:, None] * away, 0.0)
 
 
-def _keep_larger(
-    kept: Float[np.ndarray, "V 3"],
-    offered: Float[np.ndarray, "n 3"],
-    index: Int[np.ndarray, " n"] | None = None,
-) -> None:
-    """Replace rows of ``kept`` (those of ``index``) where ``offered`` is longer."""
-    rows = kept if index is None else kept[index]
-    larger = np.einsum("vc,vc->v", offered, offered) > np.einsum("vc,vc->v", rows, rows)
-    kept[larger if index is None else index[larger]] = offered[larger]
-
-
 def _largest_per_vertex(
     corner: Int[np.ndarray, "n 3"], push: Float[np.ndarray, "n 3 3"], num_vertices: int
 ) -> Float[np.ndarray, "V 3"]:
@@ -293,15 +281,6 @@ def _largest_per_vertex(
     largest = np.zeros((num_vertices, 3))
     largest[vertex[order]] = push[order]  # the last write to a row wins: the longest push
     return largest
-
-
-def _spread(lift: Float[np.ndarray, "V 3"], average: csr_array, rings: int) -> Float[np.ndarray, "V 3"]:
-    """Let neighbours follow: a screened Laplace equation, lifted vertices held, by Jacobi rounds."""
-    held = (lift != 0).any(1)
-    spread = lift
-    for _ in range(rings if held.any() else 0):
-        spread = np.where(held[:, None], lift, _SPREAD_DECAY * (average @ spread))
-    return spread
 
 
 def _any_corner(mask: Bool[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:

@@ -1,0 +1,36 @@
+"""Fields of moves over a mesh: keep the larger of two, let the neighbourhood follow."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+
+DECAY = 0.9
+"""Part of a move that the next ring of neighbours follows."""
+
+
+def keep_larger(
+    kept: Float[np.ndarray, "V 3"],
+    offered: Float[np.ndarray, "n 3"],
+    index: Int[np.ndarray, " n"] | None = None,
+) -> None:
+    """Replace rows of ``kept`` (those of ``index``) where ``offered`` is longer."""
+    rows = kept if index is None else kept[index]
+    larger = np.einsum("vc,vc->v", offered, offered) > np.einsum("vc,vc->v", rows, rows)
+    kept[larger if index is None else index[larger]] = offered[larger]
+
+
+def spread(
+    move: Float[np.ndarray, "V 3"], neighbour_average: csr_array, rings: int
+) -> Float[np.ndarray, "V 3"]:
+    """Let neighbours follow: a screened Laplace equation, by Jacobi rounds; moved vertices keep their move.
+
+    Args:
+        move: Moves [m]; rows that are exactly zero are free to follow.
+        neighbour_average: Averages a field over the neighbours of each vertex.
+        rings: Rounds, and so the number of rings that are reached.
+    """
+    held = (move != 0).any(1)
+    field = move
+    for _ in range(rings if held.any() else 0):
+        field = np.where(held[:, None], move, DECAY * (neighbour_average @ field))
+    return field
