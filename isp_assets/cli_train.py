@@ -139,6 +139,8 @@ def drape(
     garments: Annotated[int, typer.Option(help="Garments to learn from.")] = 60,
 ) -> None:
     """Train a category's displacements on physics alone: CATEGORY.safetensors (Eq. 8)."""
+    from dataclasses import replace
+
     from isp_assets.body import Body
     from isp_assets.bundle import GarmentBundle, SkinBundle
     from isp_assets.pipeline import split_names
@@ -146,7 +148,7 @@ def drape(
     from isp_assets.train.poses import PoseSource
     from isp_assets.train.wardrobe import WardrobeOptions
 
-    run = _run(minutes, steps, seed, resume, device)
+    run = replace(_run(minutes, steps, seed, resume, device), hold=0.2)  # noisy losses want a long decay
     held_out = split_names(hold_out)
     options = DisplacementOptions(
         wardrobe=WardrobeOptions(garments=garments), poses=PoseSource(motions, held_out=held_out)

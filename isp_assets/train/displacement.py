@@ -41,11 +41,11 @@ _QUICK_GARMENTS, _TEST_FRAMES = 3, 8
 class DisplacementOptions:
     """What D_s is trained on."""
 
-    network: DrapeFieldConfig = DrapeFieldConfig()
+    network: DrapeFieldConfig = field(default_factory=DrapeFieldConfig)
     """Size; its code size and code scale are replaced by the bundle's."""
-    wardrobe: WardrobeOptions = WardrobeOptions()
+    wardrobe: WardrobeOptions = field(default_factory=WardrobeOptions)
     poses: PoseSource = field(default_factory=PoseSource)
-    contact: Contact = Contact()
+    contact: Contact = field(default_factory=Contact)
     frames: int = 8
     """Poses a step."""
     garments: int = 2
@@ -86,15 +86,16 @@ class DisplacementTask:
         samples = build_wardrobe(bundle, body, skin.skin_field, wardrobe, seed=seed)
         self.wardrobe = [sample.to(self.device) for sample in samples]
         self.clips = load_clips(options.poses)
-        self.module = DrapeField(config).to(self.device)
+        self.module = _first_network(config, bundle.drape_field).to(self.device)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         rate = self.options.learning_rate
-        maps = [value for name, value in self.module.named_parameters() if not name.startswith("mlp.")]
-        return [
-            {"params": list(self.module.mlp.parameters()), "lr": rate},
-            {"params": maps, "lr": 2 * rate},
-        ]
+        groups = [{"params": list(self.module.mlp.parameters()), "lr": rate}]
+        # Adam moves every texel alike, and neighbours that move apart strain the cloth: fine maps go slowly.
+        groups.append({"params": [self.module.fine], "lr": 0.3 * rate})
+        if self.module.config.coarse_size:
+            groups.append({"params": [self.module.coarse], "lr": 2 * rate})
+        return groups
 
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
         """The terms of Eq. 8 on a scale on which hard poses do not drown the others."""
@@ -191,9 +192,18 @@ class DisplacementTask:
 
 def train_displacement(
     bundle: GarmentBundle, skin: SkinBundle, out: Path, run: RunOptions, *,
-    body: Body, options: DisplacementOptions | None = None,
+    body: Body, options: DisplacementOptions | None = None, gap_iterations: int = 300,
 ) -> GarmentBundle:  # fmt: skip
     """Train D_s and write ``CATEGORY.safetensors``, the bundle with its displacement network, into ``out``.
+
+    Args:
+        bundle: The category's garments. A displacement network that it already has is trained further.
+        skin: The diffused skinning of the body.
+        out: Folder; also takes the checkpoint and the history.
+        run: Budget and device.
+        body: The body that all was made for.
+        options: What to train on.
+        gap_iterations: Effort of the reference minima that the last figures compare with.
 
     Raises:
         TrainError: If bundle, skin field and body do not belong together.
@@ -207,11 +217,22 @@ def train_displacement(
     task = DisplacementTask(
         bundle, skin, body, options or DisplacementOptions(), device=run.device, seed=run.seed
     )
-    report = train(task, out, run)
-    metrics = task.measure_on(task.wardrobe[: 2 * _QUICK_GARMENTS]) | energy_gap(task)
+    train(task, out, run)
+    metrics = task.measure_on(task.wardrobe[: 2 * _QUICK_GARMENTS]) | energy_gap(
+        task, iterations=gap_iterations
+    )
     result = with_displacement(bundle, out, metrics=metrics)
     result.save(Path(out) / f"{bundle.category}.safetensors")
     return result
+
+
+def _first_network(config: DrapeFieldConfig, earlier: DrapeField | None) -> DrapeField:
+    """A copy of the bundle's present network if it has this size, else an untrained one."""
+    network = DrapeField(config)
+    if earlier is not None and replace(earlier.config, code_scale=config.code_scale) == config:
+        network.config = earlier.config
+        network.load_state_dict(earlier.state_dict())
+    return network
 
 
 def with_displacement(

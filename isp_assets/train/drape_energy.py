@@ -36,6 +36,9 @@ class Contact:
     """Weight of its square per mass [1/s²], at the end of training."""
     first_stiffness: float = 2e4
     """The same at the start."""
+    depth: float = 0.025
+    """Lacking clearance beyond which the penalty grows linearly [m]: where a posed body cuts into itself,
+    no cloth can be clear of both sides."""
 
     def at(self, progress: float) -> float:
         """Stiffness after a share of the training, growing geometrically."""
@@ -67,13 +70,14 @@ def drape_energies(
 ) -> dict[str, Float[Tensor, " T"]]:  # fmt: skip
     """The terms of Eq. 8 [J]: strain, bending, gravity, collision."""
     lacking = torch.relu(contact.margin - clearance(vertices, body))
+    near = lacking.clamp_max(contact.depth)
+    penalty = contact.cubic * near.pow(3) + 0.5 * stiffness * rest.mass * near.square()
+    slope = 3 * contact.cubic * contact.depth**2 + stiffness * rest.mass * contact.depth
     return {
         "strain": membrane_energy(vertices, rest, fabric),
         "bending": bending_energy(vertices, rest, fabric),
         "gravity": gravity_energy(vertices, rest),
-        "collision": (contact.cubic * lacking.pow(3) + 0.5 * stiffness * rest.mass * lacking.square()).sum(
-            -1
-        ),
+        "collision": (penalty + slope * (lacking - near)).sum(-1),
     }
 
 

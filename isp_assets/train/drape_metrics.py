@@ -98,7 +98,7 @@ def minimise(
         x = torch.tensor(unknown, device=device).reshape(start.shape).requires_grad_(True)
         total = sum(case.energies((start + scale * x)[None]).values()).sum()
         (gradient,) = torch.autograd.grad(total, x)
-        return float(total), gradient.cpu().numpy().reshape(-1)
+        return float(total.detach()), gradient.cpu().numpy().reshape(-1)
 
     zero = np.zeros(start.numel())
     with torch.enable_grad():

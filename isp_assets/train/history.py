@@ -13,17 +13,19 @@ class History:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows: list[dict[str, float]] = []
+        self.rows: list[dict[str, float | int]] = []
 
     def take_up(self, step: int) -> None:
         """Read the rows that an earlier run wrote up to ``step``; later ones are forgotten."""
         if not self.path.is_file():
             return
         with self.path.open(newline="", encoding="utf-8") as file:
-            rows = [{name: float(value) for name, value in row.items() if value} for row in csv.DictReader(file)]
+            rows = [
+                {name: _number(value) for name, value in row.items() if value} for row in csv.DictReader(file)
+            ]
         self.rows = [row for row in rows if row["step"] <= step]
 
-    def add(self, row: Mapping[str, float]) -> None:
+    def add(self, row: Mapping[str, float | int]) -> None:
         """Append a row and write the file."""
         self.rows.append(dict(row))
         text = io.StringIO()
@@ -56,3 +58,8 @@ class History:
                 axes.legend(fontsize=7)
         figure.savefig(path, dpi=110, metadata={"Software": None})
         return True
+
+
+def _number(text: str) -> float:
+    """A whole number stays one, so that a resumed table reads as an uninterrupted one."""
+    return int(text) if text.lstrip("-").isdigit() else float(text)

@@ -21,7 +21,7 @@ from isp_assets.motion import Motion, builtin_motions
 
 _NOISE = 0.05  # of every joint [rad]
 _LARGEST_BLEND = 0.5
-_SCRAMBLED_SHARE = 0.3
+_SCRAMBLED_SHARE = 0.2
 _SPREAD = {
     "pelvis": (0.2, 0.0, 0.2), "spine1": (0.12, 0.12, 0.08), "spine2": (0.08, 0.08, 0.06),
     "spine3": (0.08, 0.08, 0.06), "neck": (0.15, 0.15, 0.1),

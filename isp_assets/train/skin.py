@@ -106,6 +106,7 @@ class SkinTask:
         square = torch.cdist(samples.points, self.surfaces[rest]).square()
         return (self.area.log() - 0.5 * square / samples.width[:, None].square()).softmax(-1)
 
+    @torch.no_grad()
     def measure(self) -> dict[str, float]:
         """Errors of what is folded out of the weights, and their steepness, on held-out points."""
         figures = [self._measure(samples, rest) for rest, samples in enumerate(self.held_out)]

@@ -1,6 +1,6 @@
 """Garments to train draping on: decoded, bound and measured once."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from isp_assets.body import Body
 from isp_assets.bundle import GarmentBundle
+from isp_assets.decode import RESOLUTIONS
 from isp_assets.displacement import anchor_ramp, panel_sampler
 from isp_assets.errors import DecodeError, GeometryError, TrainError
 from isp_assets.garment import Garment
@@ -53,8 +54,8 @@ class WardrobeOptions:
 
     garments: int = 60
     """Training garments; named ones first, then jittered and mixed codes."""
-    resolution: int = 90
-    """Grid cells across a panel; 90 give edges of about 18 mm."""
+    edge_length: float = 0.02
+    """Triangle side [m]."""
     map_size: int = 64
 
 
@@ -86,11 +87,13 @@ def build_wardrobe(
         TrainError: If fewer than half of the garments asked for can be made.
     """
     wardrobe: list[WornSample] = []
-    for name, code in _codes(bundle, 3 * options.garments, np.random.default_rng(seed)):
+    lowest, highest = RESOLUTIONS
+    resolution = round(np.clip(2 * bundle.model.panel_scale / options.edge_length, lowest, highest))
+    for code in _codes(bundle, 3 * options.garments, np.random.default_rng(seed)):
         if len(wardrobe) == options.garments:
             break
         try:
-            garment = bundle.decode(code, resolution=options.resolution)
+            garment = bundle.decode(code, resolution=resolution)
             sample = make_sample(garment, bundle, body, skin, map_size=options.map_size, fabric=Fabric())
         except (DecodeError, GeometryError):
             continue
@@ -98,8 +101,8 @@ def build_wardrobe(
             wardrobe.append(sample)
     if 2 * len(wardrobe) < options.garments:
         raise TrainError(
-            f"only {len(wardrobe)} of {options.garments} garments of {bundle.category!r} could be decoded soundly; "
-            "train its pattern networks and atlases longer"
+            f"only {len(wardrobe)} of {options.garments} garments of {bundle.category!r} "
+            "could be decoded soundly; train its pattern networks and atlases longer"
         )
     return wardrobe
 
@@ -109,18 +112,13 @@ def _rest_strain(sample: WornSample) -> float:
     return float(face_strain(rest, sample.rest).quantile(0.99))
 
 
-def _codes(
-    bundle: GarmentBundle, count: int, rng: np.random.Generator
-) -> Iterator[tuple[str, Float[np.ndarray, " Z"]]]:
+def _codes(bundle: GarmentBundle, count: int, rng: np.random.Generator) -> Iterator[Float[np.ndarray, " Z"]]:
     """Trained codes in random order, then jittered ones and mixtures of two, in turn."""
-    names: Sequence[str] = list(bundle.codes)
-    codes = np.stack([bundle.codes[name] for name in names])
+    codes = np.stack(list(bundle.codes.values()))
     spread = codes.std(axis=0)
-    order = rng.permutation(len(names))
-    for index in order[:count]:
-        yield names[index], codes[index]
+    yield from codes[rng.permutation(len(codes))[:count]]
     for _ in range(count):
         first, second = codes[rng.integers(len(codes), size=2)]
-        yield "jittered", (first + _JITTER * spread * rng.normal(size=spread.shape)).astype(np.float32)
+        yield (first + _JITTER * spread * rng.normal(size=spread.shape)).astype(np.float32)
         share = rng.uniform(0, 1)
-        yield "mixed", ((1 - share) * first + share * second).astype(np.float32)
+        yield ((1 - share) * first + share * second).astype(np.float32)
