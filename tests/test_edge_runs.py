@@ -1,10 +1,11 @@
 """Cutting an outline into labelled edges: crisp corners, noise, slivers."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isp_assets.geometry.edge_runs import EdgeRun, dissolve, split_edges
+from isp_assets.geometry.edge_runs import EdgeRun, dissolve, join_alike, split_edges
 from isp_assets.geometry.outline import resample_closed
 
 CORNERS = np.array([[-0.5, -0.6], [0.55, -0.6], [0.4, 0.5], [-0.3, 0.7]])
@@ -76,13 +77,37 @@ def test_a_smooth_meeting_point_stays_where_the_labels_change():
     np.testing.assert_allclose(runs[1].points[0], [-0.5, 0.0], atol=1e-4)
 
 
-def test_one_label_gives_one_closed_run():
+def test_sharp_corners_split_a_run_of_one_label():
+    """The tip of a V-neck stays sharp though the label does not change there."""
     points, logits = _polygon()
-    logits[:, 2] += 1000
-    (run,) = split_edges(points, logits)
+    logits[:, 2] = np.maximum(logits[:, 2], logits[:, 3])
+    logits[:, 3] = -999
+    runs = split_edges(points, logits)
+    assert sorted(run.label for run in runs) == [1, 2, 2, 4]
+    for corner in CORNERS:
+        assert min(np.linalg.norm(run.points[0] - corner) for run in runs) < 1e-9
+    joined = join_alike(runs, {2})
+    assert sorted(run.label for run in joined) == [1, 2, 4]
+    assert sum(run.length for run in joined) == pytest.approx(sum(run.length for run in runs))
+    assert join_alike(runs, {1}) == runs
+
+
+def test_one_label_gives_one_closed_run():
+    angle = np.arange(300) * 2 * np.pi / 300
+    points = 0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    (run,) = split_edges(points, np.array([[0.0, -9.0, 5.0]]).repeat(300, axis=0))
     assert run.label == 2
     np.testing.assert_array_equal(run.points[0], run.points[-1])
     assert len(run.points) == len(points) + 1
+
+
+def test_a_polygon_of_one_label_is_joined_to_one_closed_run():
+    points, logits = _polygon()
+    logits[:, 2] += 1000
+    runs = split_edges(points, logits)
+    assert [run.label for run in runs] == [2, 2, 2, 2]
+    (run,) = join_alike(runs, {2})
+    np.testing.assert_array_equal(run.points[0], run.points[-1])
 
 
 def test_turning_the_samples_round_changes_nothing():

@@ -7,6 +7,8 @@ edges join a neighbour, and every meeting point moves to the corner nearby, if t
 Lengths are network units: the panel's square is 2 wide.
 """
 
+from bisect import bisect_right
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +24,8 @@ _CHORD = 0.025
 """Length of the two chords that measure how much the outline turns."""
 _TURN = np.deg2rad(40.0)
 """Turns smaller than this are no corner."""
+_SHARP = np.deg2rad(48.0)
+"""Turns larger than this are corners even where the label stays, as at the tip of a V-neck."""
 _CONFIDENT = 6.0
 """Log odds beyond this count alike: one sure point must not outvote its neighbours."""
 
@@ -58,16 +62,17 @@ def split_edges(points: Float[np.ndarray, "n 2"], logits: Float[np.ndarray, "n L
         logits: Label logits at its points; label 0 ("no edge") is never chosen.
 
     Returns:
-        Runs in order, each ending where the next begins. A loop with one label gives one
-        run, closed on itself.
+        Runs in order, each ending where the next begins. Sharp corners end a run too, so
+        neighbours may have one label. A smooth loop with one label gives one run, closed on itself.
     """
     n = len(points)
     step = float(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).mean())
     evidence = _smooth(_log_probability(logits), round(_SMOOTHING / step))
     starts, labels = (a.tolist() for a in _merge_short(evidence, max(2, round(_SHORT / step))))
+    turn = _turning(points, max(2, round(_CHORD / step)))
+    starts, labels = _add_sharp_corners(starts, labels, turn, round(2 * _WINDOW / step))
     if len(starts) == 1:
         return (EdgeRun(labels[0] + 1, np.concatenate([points, points[:1]])),)
-    turn = _turning(points, max(2, round(_CHORD / step)))
     lengths = np.diff(np.append(starts, starts[0] + n))
     corners = []
     for k, start in enumerate(starts):
@@ -91,15 +96,18 @@ def dissolve(loop: tuple[EdgeRun, ...], index: int) -> tuple[EdgeRun, ...]:
     rotated = loop[index:] + loop[:index]
     before, after = rotated[-1], rotated[1]
     label = max((before, after), key=lambda run: run.length).label
-    return _join_alike((EdgeRun(label, rotated[0].points), *rotated[1:]))
+    return join_alike((EdgeRun(label, rotated[0].points), *rotated[1:]), {label})
 
 
-def _join_alike(loop: tuple[EdgeRun, ...]) -> tuple[EdgeRun, ...]:
-    """Merge neighbours with one label, across the loop's seam too."""
+def join_alike(loop: tuple[EdgeRun, ...], labels: Collection[int]) -> tuple[EdgeRun, ...]:
+    """Merge neighbours of one label, if it is among ``labels``; across the loop's ends too."""
     joined = [loop[0]]
     for run in loop[1:]:
-        joined = [*joined[:-1], _append(joined[-1], run)] if run.label == joined[-1].label else [*joined, run]
-    if len(joined) > 1 and joined[0].label == joined[-1].label:
+        if run.label == joined[-1].label and run.label in labels:
+            joined[-1] = _append(joined[-1], run)
+        else:
+            joined.append(run)
+    if len(joined) > 1 and joined[0].label == joined[-1].label and joined[0].label in labels:
         joined = [_append(joined[-1], joined[0]), *joined[1:-1]]
     return tuple(joined)
 
@@ -145,6 +153,23 @@ def _merge_short(evidence: Float[np.ndarray, "n K"], shortest: int):
             return np.array([0]), labels[:1]
         starts, labels = starts[new], labels[new]
     return starts, labels
+
+
+def _add_sharp_corners(starts: list[int], labels: list[int], turn: Float[np.ndarray, " n"], apart: int):
+    """Starts and labels of runs, cut at sharp corners that lie ``apart`` points or more from other starts."""
+    n = len(turn)
+    alone = len(starts) == 1
+    found = [] if alone else list(starts)
+    for corner in np.argsort(-np.abs(turn), kind="stable").tolist():
+        if abs(turn[corner]) < _SHARP:
+            break
+        if all(min((corner - s) % n, (s - corner) % n) >= apart for s in found):
+            found.append(corner)
+    if not found:
+        return starts, labels
+    # A run has the label of the last label switch at or before its start.
+    found.sort()
+    return found, [labels[bisect_right(starts, s) - 1] for s in found]
 
 
 def _turning(points: Float[np.ndarray, "n 2"], reach: int) -> Float[np.ndarray, " n"]:

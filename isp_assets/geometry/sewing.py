@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.edge_runs import EdgeRun, dissolve
+from isp_assets.geometry.edge_runs import EdgeRun, dissolve, join_alike
 from isp_assets.geometry.outline import resample_open
 from isp_assets.geometry.topology import edges, weld
 from isp_assets.geometry.triangulate import triangulate_panel
@@ -94,7 +94,10 @@ def sew_panels(
         GeometryError: If one side of a seam is missing or sewn to itself, an
             outline crosses itself, or the result is no surface.
     """
-    loops = {side: list(outlines[side]) for side in PANELS}
+    loops = {
+        side: [join_alike(loop, {pair[k] for pair in seam_pairs}) for loop in outlines[side]]
+        for k, side in enumerate(PANELS)
+    }
     matches = _match(loops, seam_pairs, sliver)
     counts = _counts(loops, matches, spacing)
     panels = {side: _triangulate(side, loops[side], counts[side], matches, spacing) for side in PANELS}
