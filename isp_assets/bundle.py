@@ -77,7 +77,8 @@ class GarmentBundle:
         if name not in self.codes:
             near = difflib.get_close_matches(name, self.codes, n=3) or list(self.codes)[:5]
             raise BundleError(
-                f"bundle {self.category!r} has no garment {name!r}; it has {len(self.codes)}, as {', '.join(near)}"
+                f"bundle {self.category!r} has no garment {name!r}; "
+                f"it has {len(self.codes)}, as {', '.join(near)}"
             )
         return self.codes[name]
 
@@ -115,7 +116,8 @@ class GarmentBundle:
         manifest = {
             "category": model.category, "garments": list(self.codes), "panel_scale": float(model.panel_scale),
             "edge_names": {str(label): name for label, name in model.edge_names.items()},
-            "seam_pairs": [list(pair) for pair in model.seam_pairs], "anchor_labels": list(model.anchor_labels),
+            "seam_pairs": [list(pair) for pair in model.seam_pairs],
+            "anchor_labels": list(model.anchor_labels),
             "networks": {name: net.config.to_dict() for name, net in networks.items()},
             "body_name": self.body_name, "body_sha256": self.body_sha256,
             "provenance": dict(self.provenance), "metrics": dict(self.metrics),
@@ -234,7 +236,11 @@ def _unpack(network: nn.Module, name: str, tensors: Mapping[str, Tensor]) -> Any
 
 
 def _save_network(
-    path: str | os.PathLike, kind: tuple[str, int], network: nn.Module, dtype: Precision, manifest: dict[str, Any]
+    path: str | os.PathLike,
+    kind: tuple[str, int],
+    network: nn.Module,
+    dtype: Precision,
+    manifest: dict[str, Any],
 ) -> None:
     content = {**manifest, "network": network.config.to_dict()}
     save_tensors(path, _pack({"network": network}, dtype), content, schema=kind[0], version=kind[1])
@@ -252,4 +258,7 @@ def _reading(path: str | os.PathLike) -> Iterator[None]:
     except BundleError as error:
         raise BundleError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise BundleError(f"{path}: the content does not fit the manifest ({error}); the file is damaged") from error
+        reason = " ".join(str(error).split())
+        raise BundleError(
+            f"{path}: the content does not fit the manifest ({reason}); the file is damaged"
+        ) from error

@@ -46,7 +46,9 @@ class GarmentModel:
                 )
         sizes = {net.config.code_size for net in (*self.panel_fields.values(), *self.atlases.values())}
         if len(sizes) != 1:
-            raise BundleError(f"category {self.category!r}: networks disagree on the code size: {sorted(sizes)}")
+            raise BundleError(
+                f"category {self.category!r}: networks disagree on the code size: {sorted(sizes)}"
+            )
         labels = {label for pair in self.seam_pairs for label in pair} | set(self.anchor_labels)
         if unknown := labels - set(self.edge_names):
             raise BundleError(f"category {self.category!r}: labels {sorted(unknown)} have no edge name")
@@ -56,7 +58,9 @@ class GarmentModel:
                 f"but edge names go to {max(self.edge_names)}"
             )
         if not self.panel_scale > 0:
-            raise BundleError(f"category {self.category!r}: panel_scale must be > 0 m, got {self.panel_scale}")
+            raise BundleError(
+                f"category {self.category!r}: panel_scale must be > 0 m, got {self.panel_scale}"
+            )
 
     @property
     def code_size(self) -> int:

@@ -73,7 +73,9 @@ def load_tensors(
             text = (file.metadata() or {}).get(_KEY)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (safetensors.SafetensorError, OSError) as error:
-        raise BundleError(f"{path}: not a readable safetensors file ({error}); copy or train it again") from error
+        raise BundleError(
+            f"{path}: not a readable safetensors file ({error}); copy or train it again"
+        ) from error
     if text is None:
         raise BundleError(f"{path}: a safetensors file without our manifest; expected kind {schema!r}")
     try:
@@ -96,6 +98,6 @@ def _check_kind(path: Path, manifest: Any, schema: str, version: int) -> None:
         raise BundleError(f"{path}: expected a file of kind {schema!r}, got {manifest.get('schema')!r}")
     if not 1 <= manifest["version"] <= version:
         raise BundleError(
-            f"{path}: version {manifest['version']} of {schema!r} is not known; this release reads 1..{version}; "
-            "upgrade isp-assets"
+            f"{path}: version {manifest['version']} of {schema!r} is not known; "
+            f"this release reads 1..{version}; upgrade isp-assets"
         )

@@ -21,9 +21,10 @@ from isp_assets.storage import load_tensors, save_tensors
 def small_bundle(**changes) -> GarmentBundle:
     model = GarmentModel(
         category="tube",
-        panel_fields={side: PanelField(PanelFieldConfig(num_labels=4, code_size=6, width=8)) for side in PANELS},
+        panel_fields={side: PanelField(PanelFieldConfig(4, code_size=6, width=8)) for side in PANELS},
         atlases={side: Atlas(AtlasConfig(code_size=6, width=8, offset=(0.1, 1.0, 0.0))) for side in PANELS},
-        edge_names={1: "right", 2: "waist", 3: "left", 4: "hem"}, seam_pairs=((1, 1), (3, 3)), anchor_labels=(2,),
+        edge_names={1: "right", 2: "waist", 3: "left", 4: "hem"},
+        seam_pairs=((1, 1), (3, 3)), anchor_labels=(2,),
         rest_pose=np.full((24, 3), 0.1), panel_center=np.array([0.0, -0.111]), panel_scale=0.8,
     )  # fmt: skip
     codes = {name: np.random.default_rng(i).normal(size=6).astype(np.float32) for i, name in enumerate("abc")}
@@ -74,7 +75,7 @@ def test_panel_coordinates_invert():
     points = torch.from_numpy(xy)
     torch.testing.assert_close(model.to_panel(model.to_network(points)), points)
     np.testing.assert_allclose(model.to_network(model.panel_center), 0)
-    assert np.abs(model.to_network(model.panel_center + [0.8, -0.8]) - [1, -1]).max() < 1e-12
+    assert np.abs(model.to_network(model.panel_center + np.array([0.8, -0.8])) - [1, -1]).max() < 1e-12
 
 
 def test_an_unknown_garment_gets_a_hint():
@@ -113,8 +114,6 @@ def test_weights_too_large_for_16_bits_are_refused(tmp_path):
     with pytest.raises(BundleError, match="store it as float32"):
         bundle.save(tmp_path / "x")
     bundle.save(tmp_path / "x", dtype="float32")
-    with pytest.raises(BundleError, match="float16 or float32"):
-        bundle.save(tmp_path / "x", dtype="bfloat16")
 
 
 def test_a_file_whose_parts_do_not_fit_is_named(tmp_path):

@@ -43,7 +43,9 @@ def test_a_hole_is_outside():
 def test_two_pieces_are_both_inside():
     points = np.concatenate([0.5 * SQUARE - [0.5, 0], 0.5 * SQUARE + [0.5, 0]])
     outline = Outline.from_loops(points, np.repeat([0, 1], 4), np.tile([1, 2, 3, 4], 2))
-    np.testing.assert_array_equal(outline.inside(np.array([[-0.5, 0], [0.5, 0], [0.0, 0]])), [True, True, False])
+    np.testing.assert_array_equal(
+        outline.inside(np.array([[-0.5, 0], [0.5, 0], [0.0, 0]])), [True, True, False]
+    )
 
 
 def test_corners_are_where_labels_change():

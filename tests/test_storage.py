@@ -73,7 +73,8 @@ def test_foreign_and_damaged_files_are_named(tmp_path):
     save_file({"a": torch.ones(1)}, tmp_path / "nojson", metadata={"isp-assets": "{"})
     save_file({"a": torch.ones(1)}, tmp_path / "nokind", metadata={"isp-assets": json.dumps({"a": 1})})
     for name, words in {
-        "missing": "no such file", "plain": "without our manifest", "cut": "not a readable", "text": "not a readable",
+        "missing": "no such file", "plain": "without our manifest", "cut": "not a readable",
+        "text": "not a readable",
         "nojson": "not JSON", "nokind": "no schema",
     }.items():  # fmt: skip
         with pytest.raises(BundleError, match=words) as caught:

@@ -1,6 +1,7 @@
 """The training loop: budgets, resuming to the bit, interruption, divergence."""
 
 import csv
+import io
 import os
 import signal
 
@@ -17,14 +18,19 @@ class LineTask:
 
     name = "line"
 
-    def __init__(self, *, width: int = 4, interrupt_at: int | None = None, poison_at: int | None = None) -> None:
+    def __init__(
+        self, *, width: int = 4, interrupt_at: int | None = None, poison_at: int | None = None
+    ) -> None:
         torch.manual_seed(1)
         self.config = {"width": width, "sizes": (1, width)}
         self.module = nn.Sequential(nn.Linear(1, width), nn.Tanh(), nn.Linear(width, 1))
         self.interrupt_at, self.poison_at, self.calls = interrupt_at, poison_at, 0
 
     def parameter_groups(self):
-        return [{"params": self.module[0].parameters(), "lr": 1e-2}, {"params": self.module[2].parameters(), "lr": 3e-2}]
+        return [
+            {"params": self.module[0].parameters(), "lr": 1e-2},
+            {"params": self.module[2].parameters(), "lr": 3e-2},
+        ]
 
     def losses(self, generator, progress):
         self.calls += 1
@@ -33,7 +39,10 @@ class LineTask:
         x = torch.rand(32, 1, generator=generator)
         y = 2 * x + 0.01 * torch.randn(32, 1, generator=generator)
         error = (self.module(x) - y).square().mean()
-        return {"fit": error * (float("nan") if self.calls == self.poison_at else 1), "size": 1e-4 * self.module[0].weight.square().sum()}
+        return {
+            "fit": error * (float("nan") if self.calls == self.poison_at else 1),
+            "size": 1e-4 * self.module[0].weight.square().sum(),
+        }
 
     def measure(self):
         x = torch.linspace(0, 1, 11)[:, None]
@@ -48,15 +57,19 @@ def weights(folder):
     return read_checkpoint(folder / CHECKPOINT)[0]
 
 
+def table(folder):
+    return list(csv.DictReader(io.StringIO((folder / "history.csv").read_text())))
+
+
 def test_training_learns_and_leaves_its_files(tmp_path):
-    report = train(LineTask(), tmp_path, run(steps=400))
+    report = train(LineTask(), tmp_path, run(steps=400, report_seconds=1e9))
     assert report.steps == 400
     assert report.metrics["error"] < 0.05
     assert {p.name for p in tmp_path.iterdir()} == {CHECKPOINT, "history.csv", "curves.png"}
-    rows = list(csv.DictReader((tmp_path / "history.csv").open()))
-    assert len(rows) == 400
-    assert float(rows[-1]["loss.fit"]) < 0.1 * float(rows[0]["loss.fit"])
-    assert sum(row["metric.error"] != "" for row in rows) == 8
+    rows = table(tmp_path)
+    assert [int(row["step"]) for row in rows] == list(range(50, 401, 50))
+    assert float(rows[-1]["loss.fit"]) < 0.5 * float(rows[0]["loss.fit"])
+    assert all(float(row["metric.error"]) > 0 for row in rows)
     manifest = read_checkpoint(tmp_path / CHECKPOINT)[1]
     assert (manifest["task"], manifest["step"], manifest["config"]["width"]) == ("line", 400, 4)
 
@@ -78,7 +91,7 @@ def test_an_interrupted_run_resumes_to_the_bit(tmp_path):
     whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
     assert report.steps == 40
     assert all(torch.equal(whole[k], parts[k]) for k in whole)
-    steps = [int(row["step"]) for row in csv.DictReader((tmp_path / "parts" / "history.csv").open())]
+    steps = [int(row["step"]) for row in table(tmp_path / "parts")]
     assert steps == list(range(1, 41))
 
 
@@ -122,4 +135,4 @@ def test_the_rate_is_held_and_then_falls():
     rates = [options.rate(p / 20) for p in range(21)]
     assert rates[:9] == [1.0] * 9
     assert rates[-1] == pytest.approx(0.01)
-    assert all(a >= b for a, b in zip(rates, rates[1:], strict=False))
+    assert rates == sorted(rates, reverse=True)

@@ -12,7 +12,15 @@ def tube_dataset(widths: tuple[float, ...] = (0.4, 0.5, 0.6), height: float = 0.
     """One tube for each panel width [m]; front and back are half cylinders."""
     garments = tuple(_tube(f"tube_{index}", width, height) for index, width in enumerate(widths))
     return GarmentDataset(
-        "tube", garments, EDGES, ((1, 1), (3, 3)), (2,), np.zeros((24, 3)), CENTER, SCALE, body_sha256="0" * 64
+        "tube",
+        garments,
+        EDGES,
+        ((1, 1), (3, 3)),
+        (2,),
+        np.zeros((24, 3)),
+        CENTER,
+        SCALE,
+        body_sha256="0" * 64,
     )
 
 
@@ -35,7 +43,12 @@ def _tube(name: str, width: float, height: float, cells: int = 8) -> TrainingGar
         depth[on_seam] = 0.0
         vertices[index] = np.column_stack([radius * np.sin(angle), xy[:, 1], depth])
     outline, label = _rectangle(width, height)
-    shared = {"xy": xy, "outline_xy": outline, "outline_label": label, "outline_loop": np.zeros(len(label), int)}
+    shared = {
+        "xy": xy,
+        "outline_xy": outline,
+        "outline_label": label,
+        "outline_loop": np.zeros(len(label), int),
+    }
     panels = {
         "front": TrainingPanel(faces=faces, vertex_index=front_index, **shared),
         "back": TrainingPanel(faces=faces[:, ::-1].copy(), vertex_index=back_index, **shared),
@@ -47,5 +60,7 @@ def _tube(name: str, width: float, height: float, cells: int = 8) -> TrainingGar
 def _rectangle(width: float, height: float, per_side: int = 50) -> tuple[np.ndarray, np.ndarray]:
     corners = np.array([[0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]]) * [width, height] + CENTER
     t = np.linspace(0, 1, per_side, endpoint=False)[:, None]
-    sides = [start + t * (end - start) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    sides = [
+        start + t * (end - start) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
     return np.concatenate(sides), np.repeat([1, 2, 3, 4], per_side)

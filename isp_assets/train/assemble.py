@@ -66,7 +66,8 @@ def assemble_bundle(
         metrics["float32"] = measure_model(model, codes, dataset)
     return GarmentBundle(
         stored, {garment.name: code for garment, code in zip(dataset.garments, codes, strict=True)},
-        dataset.body_sha256, body_name, provenance=_provenance(pattern_manifest, atlas_manifest), metrics=metrics,
+        dataset.body_sha256, body_name, metrics=metrics,
+        provenance=_provenance(pattern_manifest, atlas_manifest),
     )  # fmt: skip
 
 
@@ -86,7 +87,8 @@ def _check_pair(patterns: Path, first: Mapping[str, Any], atlases: Path, second:
     ):
         if one != two:
             raise TrainError(
-                f"{atlases} was trained on another {key} ({two}) than {patterns} has ({one}); train the atlas again"
+                f"{atlases} was trained on another {key} ({two}) than {patterns} has ({one}); "
+                "train the atlas again"
             )
 
 

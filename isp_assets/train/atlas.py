@@ -38,7 +38,7 @@ class AtlasOptions:
     normal_weight: float = 0.01
     """lambda_n of Eq. 4."""
     seam_weight: float = 0.5
-    """lambda_c of Eq. 4, but of the mean gap in metres: its square, as in the paper, fades before the gap does."""
+    """lambda_c of Eq. 4, but of the gap itself: its square, as in the paper, fades before the gap does."""
     rate: float = 1.5e-3
     garments_per_step: int = 24
     faces_per_step: int = 24
@@ -48,7 +48,12 @@ class AtlasOptions:
 
 
 def train_atlas(
-    dataset: GarmentDataset, patterns: Path, folder: Path, *, run: RunOptions, options: AtlasOptions | None = None
+    dataset: GarmentDataset,
+    patterns: Path,
+    folder: Path,
+    *,
+    run: RunOptions,
+    options: AtlasOptions | None = None,
 ) -> RunReport:
     """Train the atlases of a category, and write its bundle, ``<category>.safetensors``.
 
@@ -72,11 +77,15 @@ def train_atlas(
 class AtlasTask:
     """Eq. 4 on random garments, triangles and seam vertices."""
 
-    def __init__(self, dataset: GarmentDataset, patterns: Path, options: AtlasOptions, run: RunOptions) -> None:
+    def __init__(
+        self, dataset: GarmentDataset, patterns: Path, options: AtlasOptions, run: RunOptions
+    ) -> None:
         weights, manifest = read_checkpoint(patterns)
         digest = dataset_digest(dataset)
         if manifest["config"].get("dataset_sha256") != digest:
-            raise TrainError(f"{patterns}: these patterns were trained on another dataset; train patterns again")
+            raise TrainError(
+                f"{patterns}: these patterns were trained on another dataset; train patterns again"
+            )
         self.name = f"atlas {dataset.category}"
         self.options, self.dataset, self.device = options, dataset, torch.device(run.device)
         self.codes = weights["codes"].to(self.device)
@@ -116,7 +125,7 @@ class AtlasTask:
 
     def measure(self) -> dict[str, float]:
         chosen = np.unique(np.linspace(0, len(self.dataset.garments) - 1, 12).astype(int))
-        return measure_atlases(self.module, self.codes, self.dataset, garments=chosen.tolist())
+        return measure_atlases(dict(self.module.items()), self.codes, self.dataset, garments=chosen.tolist())
 
 
 def _atlas_config(dataset: GarmentDataset, side: str, options: AtlasOptions, code_size: int) -> AtlasConfig:

@@ -60,6 +60,6 @@ class History:
         return True
 
 
-def _number(text: str) -> float:
+def _number(text: str) -> int | float:
     """A whole number stays one, so that a resumed table reads as an uninterrupted one."""
     return int(text) if text.lstrip("-").isdigit() else float(text)

@@ -163,8 +163,10 @@ class _Run:
             group["lr"] = peak * self.options.rate(progress)
         terms = self.task.losses(self.generator, progress)
         self.optimizer.zero_grad(set_to_none=True)
-        torch.stack(list(terms.values())).sum().backward()
-        self.optimizer.step()
+        total = torch.stack(list(terms.values())).sum()
+        if total.requires_grad:  # a batch in which nothing touches teaches nothing
+            total.backward()
+            self.optimizer.step()
         for name, value in terms.items():
             self._sums[name] = self._sums.get(name, 0) + value.detach()
         self._summed += 1
@@ -173,7 +175,10 @@ class _Run:
 
     def report_due(self) -> bool:
         late = self.seconds - self._reported >= self.options.report_seconds
-        return late or self.progress >= 1 or self.save_due()
+        return late or self.save_due() or self._measurement_due()
+
+    def _measurement_due(self) -> bool:
+        return self.progress * self.options.measurements >= self._measured + 1
 
     def save_due(self) -> bool:
         return self.seconds - self._saved >= self.options.checkpoint_seconds or self.progress >= 1
@@ -184,13 +189,17 @@ class _Run:
         for name, value in losses.items():
             if not math.isfinite(value):
                 raise TrainError(
-                    f"{self.task.name}: loss {name!r} became {value} by step {self.step}; lower the learning rate, "
-                    f"or resume from the last checkpoint in {self.folder}"
+                    f"{self.task.name}: loss {name!r} became {value} by step {self.step}; "
+                    f"lower the learning rate, or resume from the last checkpoint in {self.folder}"
                 )
         self._sums, self._summed, self._reported = {}, 0, self.seconds
-        row = {"step": self.step, "seconds": round(self.seconds, 2), "lr": self.optimizer.param_groups[0]["lr"]}
+        row = {
+            "step": self.step,
+            "seconds": round(self.seconds, 2),
+            "lr": self.optimizer.param_groups[0]["lr"],
+        }
         row |= {f"loss.{name}": value for name, value in losses.items()}
-        if self.progress * self.options.measurements >= self._measured + 1:
+        if self._measurement_due():
             self._measured = int(self.progress * self.options.measurements)
             with torch.no_grad():
                 self.metrics = dict(self.task.measure())

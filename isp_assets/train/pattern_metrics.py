@@ -16,7 +16,11 @@ _NEAR, _CLOSE = 0.1, 0.03
 
 
 def measure_fields(
-    fields: Mapping[str, nn.Module], codes: Float[Tensor, "G Z"], dataset: GarmentDataset, *, garments: Sequence[int]
+    fields: Mapping[str, nn.Module],
+    codes: Float[Tensor, "G Z"],
+    dataset: GarmentDataset,
+    *,
+    garments: Sequence[int],
 ) -> dict[str, float]:
     """Mean errors over some garments, both panels.
 

@@ -81,7 +81,8 @@ class PatternTask:
         self.module: PatternNetworks = PatternNetworks(config, len(dataset.garments)).to(self.device)
         self.config: Mapping[str, Any] = {
             "options": asdict(options), "field": config.to_dict(), "category": dataset.category,
-            "garments": [garment.name for garment in dataset.garments], "dataset_sha256": dataset_digest(dataset),
+            "garments": [garment.name for garment in dataset.garments],
+            "dataset_sha256": dataset_digest(dataset),
         }  # fmt: skip
         self.samples = _sample_dataset(dataset, options.sampling, run.seed, self.device)
 
@@ -111,8 +112,9 @@ class PatternTask:
         }
 
     def measure(self) -> dict[str, float]:
-        chosen = np.unique(np.linspace(0, len(self.dataset.garments) - 1, 8).astype(int))
-        return measure_fields(self.module.fields, self.module.codes.detach(), self.dataset, garments=chosen)
+        chosen = np.unique(np.linspace(0, len(self.dataset.garments) - 1, 8).astype(int)).tolist()
+        fields = dict(self.module.fields.items())
+        return measure_fields(fields, self.module.codes.detach(), self.dataset, garments=chosen)
 
 
 def panel_outline(dataset: GarmentDataset, panel: TrainingPanel) -> Outline:
