@@ -1,6 +1,7 @@
 """Training of D_m: stacks, losses, that it clears contact, and the bundle it writes."""
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from isp_assets.train.loop import RunOptions, train
 
 OPTIONS = LayeringOptions(
     network=LayeringConfig(features=4, map_size=32, levels=2),
-    garments=2, held_out=0, resolution=32, frames=2, learning_rate=5e-3,
+    garments=2, held_out=0, edge_length=0.07, frames=2, learning_rate=5e-3,
 )  # fmt: skip
 
 
@@ -83,13 +84,16 @@ def test_losses_depend_on_the_generator_alone_and_reach_the_network(task: Layeri
 
 
 def test_untrained_network_neither_moves_nor_lifts(task: LayeringTask) -> None:
-    figures = task.measure_on(stacks=2)
+    figures = task.measure_on(stacks=1)
     for name in ("body_area_percent", "layer_area_percent", "crossing_pairs", "strain_p99"):
         assert figures[f"before.{name}"] == figures[f"after.{name}"]
 
 
 def test_training_clears_contact_with_the_layers_beneath(task: LayeringTask, tmp_path: Path) -> None:
     state = {k: v.clone() for k, v in task.module.state_dict().items()}
+    # The pillows are strained far beyond any cloth: let contact outweigh that.
+    eager = copy(task)
+    eager.options = replace(OPTIONS, layer_weight=1e4)
 
     def lacking() -> float:
         generator, total = torch.Generator().manual_seed(5), 0.0
@@ -103,9 +107,8 @@ def test_training_clears_contact_with_the_layers_beneath(task: LayeringTask, tmp
 
     with torch.no_grad():
         before = lacking()
-        train_options = RunOptions(steps=30)
         with torch.enable_grad():
-            train(task, tmp_path, train_options)
+            train(eager, tmp_path, RunOptions(steps=30, measurements=1))
         assert lacking() < 0.8 * before
     task.module.load_state_dict(state)
 

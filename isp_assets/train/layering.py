@@ -23,6 +23,8 @@ from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric
+from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.skinning import shape_garment
@@ -47,8 +49,8 @@ class LayeringOptions:
     """Garments of each category."""
     held_out: int = 4
     """The last garments of each category are kept for the test."""
-    resolution: int = 90
-    """Grid cells across a panel."""
+    edge_length: float = 0.02
+    """Length of the garments' edges [m]."""
     poses: PoseSource = field(default_factory=PoseSource)
     contact: Contact = field(default_factory=lambda: Contact(margin=0.005))
     """Contact with the body and, times ``layer_weight``, with inner garments."""
@@ -97,7 +99,9 @@ class LayeringTask:
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
         self.module = LayeringNet(options.network).to(self.device)
-        wardrobe = WardrobeOptions(options.garments, options.resolution, options.network.map_size)
+        wardrobe = WardrobeOptions(
+            garments=options.garments, edge_length=options.edge_length, map_size=options.network.map_size
+        )
         by_category = [
             build_wearers(bundle, body, skin, wardrobe, self.module, device=self.device, seed=seed)
             for bundle in bundles
@@ -131,18 +135,16 @@ class LayeringTask:
         beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
         layers = 3 if float(torch.rand((), generator=generator)) < self.options.deep_share else 2
         chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (layers,), generator=generator)]
+        layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen])
         inner = []
-        for wearer in chosen[:-1]:
-            vertices = wearer.drape(posed, betas.to(self.device))
+        for wearer, vertices in zip(chosen[:-1], layers[:-1], strict=True):
             if inner:
                 vertices, _ = correct_layer(wearer.layering, vertices, beneath, posed, ramp=wearer.ramp)
             # A plain push stands in for the projection that follows in use.
             vertices = vertices + force(vertices, beneath, margin=self.options.contact.margin / 2)
             inner.append((wearer, vertices))
             beneath.append(Surface.of_mesh(vertices, wearer.rest.faces, reach=LAYER_REACH))
-        outer = chosen[-1]
-        draped = outer.drape(posed, betas.to(self.device))
-        return Stack(outer, posed, betas.to(self.device), draped, tuple(beneath), tuple(inner))
+        return Stack(chosen[-1], posed, betas.to(self.device), layers[-1], tuple(beneath), tuple(inner))
 
     def _scaled(self, stack: Stack, vertices: Tensor, stiffness: float) -> dict[str, Tensor]:
         options, contact = self.options, self.options.contact
@@ -194,6 +196,18 @@ class LayeringTask:
             )
             rows.append(measure_layering(stack, lifted, self.body))
         return {name: float(sum(row[name] for row in rows) / len(rows)) for name in rows[0]}
+
+
+def _tucked(wearers: Sequence[Wearer], layers: list[Float[Tensor, "T _ 3"]]) -> list[Float[Tensor, "T _ 3"]]:
+    """Layers whose wide inner ones gave way to the outer ones, as in use; the outermost stays as it is."""
+    arrays = [layer.double().cpu().numpy() for layer in layers]
+    for frame in range(len(arrays[0])):
+        covers: list[Obstacle] = []
+        for index in reversed(range(len(wearers))):
+            mesh = wearers[index].collision
+            arrays[index][frame] = tuck(arrays[index][frame], mesh, covers)
+            covers.append(Obstacle(mesh, arrays[index][frame], margin=0.0))
+    return [torch.as_tensor(array).to(layer) for array, layer in zip(arrays, layers, strict=True)]
 
 
 def train_layering(

@@ -17,6 +17,7 @@ from isp_assets.displacement import (
 )
 from isp_assets.drape_features import drape_features
 from isp_assets.geometry.energy import ClothRest
+from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField
 from isp_assets.networks.layering_net import LayeringNet
@@ -36,6 +37,7 @@ class Wearer:
     field: DrapeField | None
     displacement: BoundDisplacement | None
     layering: BoundLayering
+    collision: CollisionMesh
 
     def drape(self, posed: PosedBody, betas: Float[Tensor, " B"]) -> Float[Tensor, "T V 3"]:
         """Positions after skinning and D_s [m]."""
@@ -79,6 +81,7 @@ def build_wearers(
                 field=field,
                 displacement=displacement,
                 layering=bind_layering(network, sample.garment, sample.sampler, device=device),
+                collision=CollisionMesh.build(sample.garment.faces, sample.bound.joint_weights.cpu().numpy()),
             )
         )
     return wearers
