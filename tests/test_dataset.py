@@ -15,13 +15,13 @@ from isp_assets.train.garment_maker import CATEGORIES, GarmentMaker
 pytest.importorskip("numba")
 pytest.importorskip("ipctk")
 
-EDGE = 0.04  # coarse, for speed
+EDGE = 0.05  # coarse, for speed
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("data")
-    make_dataset(out, counts={"top": 1, "skirt": 2}, seed=3, workers=1, edge_length=EDGE)
+    make_dataset(out, counts={"skirt": 3}, seed=3, workers=1, edge_length=EDGE)
     return out
 
 
@@ -33,7 +33,7 @@ def contents(folder):
 
 def test_a_category_comes_back_whole(folder):
     data = load_dataset(folder, "skirt")
-    assert [g.name for g in data.garments] == ["mini_skirt", "pencil_skirt"]
+    assert [g.name for g in data.garments] == ["mini_skirt", "pencil_skirt", "a_line_skirt"]
     assert data.edge_names == CATEGORIES["skirt"].edge_names
     assert data.seam_pairs == ((1, 1), (3, 3))
     assert data.anchor_labels == (2,)
@@ -61,7 +61,7 @@ def test_the_index_counts_and_summarises(folder):
     assert index["schema"] == "isp-assets/dataset"
     assert index["seed"] == 3
     skirts = index["categories"]["skirt"]
-    assert skirts["files"] == ["0000_mini_skirt.npz", "0001_pencil_skirt.npz"]
+    assert skirts["files"] == ["0000_mini_skirt.npz", "0001_pencil_skirt.npz", "0002_a_line_skirt.npz"]
     assert isinstance(skirts["rejections"], list)
     strain = skirts["statistics"]["strain_mean"]
     assert strain["min"] <= strain["median"] <= strain["max"]
@@ -75,17 +75,17 @@ def test_a_cut_off_run_is_completed_with_the_same_bytes(folder):
     damaged.write_bytes(damaged.read_bytes()[:5000])
     seen = []
     make_dataset(
-        folder, counts={"top": 1, "skirt": 2}, seed=3, workers=1, edge_length=EDGE,
+        folder, counts={"skirt": 3}, seed=3, workers=1, edge_length=EDGE,
         progress=lambda done, total, message: seen.append((done, total, message)),
     )  # fmt: skip
-    assert [(done, total) for done, total, _ in seen] == [(2, 3), (3, 3)]  # the top was kept
+    assert [(done, total) for done, total, _ in seen] == [(2, 3), (3, 3)]  # the third was kept
     assert contents(folder) == before
 
 
 def test_garments_of_another_recipe_are_not_touched(folder):
     before = contents(folder)
     with pytest.raises(DatasetError, match="choose another folder"):
-        make_dataset(folder, counts={"top": 1}, seed=4, workers=1, edge_length=EDGE)
+        make_dataset(folder, counts={"skirt": 1}, seed=4, workers=1, edge_length=EDGE)
     assert contents(folder) == before
 
 
@@ -129,31 +129,31 @@ def test_bad_counts_are_named(tmp_path, counts):
 
 def test_bad_files_are_named(tmp_path, folder):
     with pytest.raises(DatasetError, match="holds no complete data set"):
-        load_dataset(tmp_path, "top")
+        load_dataset(tmp_path, "skirt")
     with pytest.raises(DatasetError, match="no category 'trousers'"):
         load_dataset(folder, "trousers")
     (tmp_path / "dataset.json").write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
-        load_dataset(tmp_path, "top")
+        load_dataset(tmp_path, "skirt")
     (tmp_path / "dataset.json").write_text('{"schema": "isp-assets/dataset", "version": 99}')
     with pytest.raises(DatasetError, match="expected schema isp-assets/dataset version 1, got"):
-        load_dataset(tmp_path, "top")
+        load_dataset(tmp_path, "skirt")
     index = json.loads((folder / "dataset.json").read_text())
     (tmp_path / "dataset.json").write_text(json.dumps(index))
-    with pytest.raises(DatasetError, match=r"0000_tank_top\.npz is missing or damaged"):
-        load_dataset(tmp_path, "top")
+    with pytest.raises(DatasetError, match=r"0000_mini_skirt\.npz is missing or damaged"):
+        load_dataset(tmp_path, "skirt")
 
 
 def test_pickled_arrays_are_never_read(tmp_path, folder):
     index = json.loads((folder / "dataset.json").read_text())
     (tmp_path / "dataset.json").write_text(json.dumps(index))
-    (tmp_path / "top").mkdir()
-    np.savez(tmp_path / "top/0000_tank_top.npz", meta=np.array({"a": 1}, dtype=object))
+    (tmp_path / "skirt").mkdir()
+    np.savez(tmp_path / "skirt/0000_mini_skirt.npz", meta=np.array({"a": 1}, dtype=object))
     with pytest.raises(DatasetError, match="allow_pickle"):
-        load_dataset(tmp_path, "top")
+        load_dataset(tmp_path, "skirt")
 
 
 @pytest.mark.slow
 def test_two_processes_make_the_same_garments(tmp_path, folder):
-    make_dataset(tmp_path, counts={"top": 1, "skirt": 2}, seed=3, workers=2, edge_length=EDGE)
+    make_dataset(tmp_path, counts={"skirt": 3}, seed=3, workers=2, edge_length=EDGE)
     assert contents(tmp_path) == contents(folder)

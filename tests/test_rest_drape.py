@@ -41,7 +41,6 @@ def test_the_start_is_clear_of_the_body_and_keeps_the_pattern(category, name):
     start = wrapped_start(pattern, body)
     assert np.array_equal(start[:, :2], pattern.vertex_xy)
     assert body.distance.sample(start).min() > 0.004
-    assert not intersects(start, pattern.faces, body)
     normal = np.cross(*(start[pattern.faces[:, k]] - start[pattern.faces[:, 0]] for k in (1, 2)))
     side = np.repeat([1, -1], [len(p.faces) for p in pattern.panels.values()])
     assert (normal[:, 2] * side > 0).all()  # the sewn surface faces outwards
@@ -64,23 +63,23 @@ def test_the_waist_ring_is_level_symmetric_and_as_long_as_the_pattern():
 
 
 def test_the_energy_is_the_training_energy_plus_contact_with_a_true_gradient():
-    pattern, body, settings = sewn("top", "crop_top"), rest_body("top"), DrapeSettings()
+    pattern, body, settings = sewn("skirt", "a_line_skirt"), rest_body("skirt"), DrapeSettings()
     cloth = cloth_rest(pattern.faces, pattern.corner_xy, len(pattern.vertex_xy), settings.fabric)
     evaluate = energy_function(pattern, cloth, body, settings)
-    x = wrapped_start(pattern, body)
+    x = wrapped_start(pattern, body) + 0.005 * pattern.vertex_side[:, None] * (0, 0, 1)  # sheets apart
     position = torch.from_numpy(x)
     terms = membrane_energy(position, cloth, settings.fabric) + bending_energy(
         position, cloth, settings.fabric
     )
     expected = (terms + gravity_energy(position, cloth)).item()
     assert evaluate(x)[0] == pytest.approx(expected, rel=1e-12)
-    deep = x - 0.010 * np.sign(x[:, 2:]) * [0, 0, 1]  # now within the margin
+    deep = x - 0.015 * pattern.vertex_side[:, None] * (0, 0, 1)  # within the margin
     energy, gradient = evaluate(deep)
     elastic = membrane_energy(torch.from_numpy(deep), cloth, settings.fabric).item()
     assert energy > elastic + 0.001
     rng, h = np.random.default_rng(0), 1e-7
     for _ in range(5):
-        direction = rng.normal(size=x.shape) * (np.abs(deep[:, :1]) < 0.5)
+        direction = rng.normal(size=x.shape)
         slope = (evaluate(deep + h * direction)[0] - evaluate(deep - h * direction)[0]) / (2 * h)
         assert slope == pytest.approx((gradient * direction).sum(), rel=1e-3, abs=1e-4)
 

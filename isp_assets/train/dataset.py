@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import DatasetError
-from isp_assets.train.garment_maker import CATEGORIES, FILE_VERSION, GarmentMaker, Recipe
+from isp_assets.train.garment_maker import CATEGORIES, FILE_VERSION, UNREADABLE, GarmentMaker, Recipe
 from isp_assets.train.worker_pool import run_tasks
 
 Progress = Callable[[int, int, str], None]
@@ -185,7 +185,7 @@ def _load_garment(path: Path) -> TrainingGarment:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
         meta = json.loads(str(arrays.pop("meta")))
-    except (OSError, ValueError, KeyError) as error:
+    except UNREADABLE as error:
         raise DatasetError(
             f"{path} is missing or damaged ({error}); run make_dataset on the folder again"
         ) from error

@@ -2,6 +2,7 @@
 
 import json
 import os
+import zipfile
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +23,8 @@ from isp_assets.train.rest_drape import DrapeSettings, RestShape, drape_to_rest
 
 CATEGORIES: dict[str, PatternCategory] = {c.name: c for c in (TOP, SKIRT, TROUSERS)}
 FILE_VERSION = 1
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+"""What a missing or damaged garment file raises."""
 
 _ATTEMPTS = 8
 _OUTLINE_SPACING = 0.004
@@ -88,7 +91,7 @@ class GarmentMaker:
         path = self.path(category, index)
         try:
             meta = self.read_meta(path)
-        except (OSError, ValueError, KeyError):
+        except UNREADABLE:
             return False
         expected = self._provenance()
         if meta["version"] != FILE_VERSION or meta["provenance"] != expected:
@@ -153,7 +156,11 @@ class GarmentMaker:
         pattern = CATEGORIES[category].draw(body, standing, parameters)
         sewn = sew(pattern, self.recipe.edge_length)
         # A preset cannot be drawn again: a repeated try differs by settling longer.
-        settings = DrapeSettings(substeps=1000 + 250 * attempt, iterations=250 + 100 * attempt)
+        settings = DrapeSettings(
+            substeps=1000 + 250 * attempt,
+            iterations=250 + 100 * attempt,
+            margin=max(0.006, self.recipe.edge_length / 3),  # longer edges cut deeper into round shoulders
+        )
         return pattern, sewn, drape_to_rest(sewn, body, settings)
 
     def _fault(self, category: str, sewn: SewnPattern, rest: RestShape) -> str | None:
