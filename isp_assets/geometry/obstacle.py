@@ -134,6 +134,11 @@ class Obstacle:
         return probe.height < 0.6 * self.margin
 
     @cached_property
+    def mean_edge(self) -> float:
+        """Mean length of the triangles' edges [m]."""
+        return mean_edge(self.vertices, self.mesh.topology.faces)
+
+    @cached_property
     def part_boxes(self) -> Float[np.ndarray, "6 2 3"]:
         """Bounding box of each part [m]; an empty part has an inverted box, which holds nothing."""
         boxes = np.full((len(BODY_PARTS), 2, 3), [[np.inf] * 3, [-np.inf] * 3])
@@ -175,3 +180,9 @@ class Obstacle:
                 face_normals=self.face_normals,
             )
         return self._queries[part]
+
+
+def mean_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
+    """Mean length of the first edge of every triangle [m]."""
+    side = vertices[faces[:, 1]] - vertices[faces[:, 0]]
+    return float(np.sqrt(np.einsum("fc,fc->f", side, side)).mean())

@@ -11,6 +11,7 @@ Positions are in metres, in one shared space. NumPy, one frame and one garment a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import keep_larger, spread
 
 BODY_MARGIN = 0.003
@@ -33,6 +34,9 @@ _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
 _WATCHED = 0.02  # vertices this near [m] at the start are looked at again in every round
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _FINISH_STEP = 0.004  # largest lift [m] of one such correction
+_MOST_RINGS = 8
+_SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
+_PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
 
 
@@ -108,13 +112,14 @@ def project(
 class _Neighbour:
     """What is known of one obstacle: where the garment comes near it."""
 
-    def __init__(self, obstacle: Obstacle, found: Closest) -> None:
+    def __init__(self, obstacle: Obstacle, found: Closest, *, edge: float) -> None:
         self.obstacle = obstacle
         topology = obstacle.mesh.topology
         near = np.abs(found.height) < _WATCHED
         close = np.zeros(len(obstacle.vertices), bool)
         close[topology.faces[found.face[near]]] = True
-        for _ in range(2):  # garment triangles may be larger than the ones beneath
+        # A garment triangle may span many of the ones beneath: look as far around as it reaches.
+        for _ in range(1 + min(math.ceil(edge / obstacle.mean_edge), _MOST_RINGS)):
             close[topology.faces[_any_corner(close, topology.faces)]] = True
         self.watched = near
         self.watched_foreign: Bool[np.ndarray, " V"] | None = None
@@ -137,22 +142,24 @@ class _Projector:
         self.start = self.position = position
         self.mesh, self.options = mesh, options
         first = [o.contacts(position, mesh.parts, within=_WATCHED) for o in obstacles]
-        self.near = [_Neighbour(o, found) for o, found in zip(obstacles, first, strict=True)]
+        edge = mean_edge(position, mesh.topology.faces)
+        self.near = [_Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
         for neighbour in self.near:
             self.tight |= neighbour.cramped
 
     def lift(self) -> int:
-        """Lift vertices, and triangles from the second round on; the number of rounds taken."""
+        """Lift vertices, and triangles once most vertices are clear; the number of rounds taken."""
         options = self.options
         for done in range(options.rounds):
             last = done == options.rounds - 1
             lift = self._lift_vertices(foreign=not last)
-            if done > 0:
+            if done > 0 or not lift.any():
                 keep_larger(lift, self._lift_triangles(self.position + lift))
             if np.abs(lift).max(initial=0) < options.tolerance:
                 return done
-            step = spread(lift, self.mesh.neighbour_average, 0 if last else options.spread)
+            rings = 0 if last else options.spread
+            step = spread(lift, self.mesh.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
             self._move(step)
         return options.rounds
 
@@ -254,7 +261,7 @@ class _Projector:
         mine, theirs = unit_face_normals(self.position, faces), obstacle.face_normals[pairs[:, 1]]
         alike = np.einsum("pc,pc->p", mine, theirs)
         # Where the other triangle stands across the garment (a fold), its plane leads nowhere.
-        plane = np.where((alike > _SAME_SIDE)[:, None], theirs, mine)
+        plane = np.where((alike > _PARALLEL)[:, None], theirs, mine)
         top = np.einsum("pkc,pc->pk", obstacle.vertices[beneath], plane).max(1)
         height = np.einsum("pkc,pc->pk", self.position[faces], plane)
         need = (top[:, None] + _CLEAR - height).clip(0, _FINISH_STEP)

@@ -4,9 +4,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-DECAY = 0.9
-"""Part of a move that the next ring of neighbours follows."""
-
 
 def keep_larger(
     kept: Float[np.ndarray, "V 3"],
@@ -20,7 +17,7 @@ def keep_larger(
 
 
 def spread(
-    move: Float[np.ndarray, "V 3"], neighbour_average: csr_array, rings: int
+    move: Float[np.ndarray, "V 3"], neighbour_average: csr_array, *, rings: int, decay: float
 ) -> Float[np.ndarray, "V 3"]:
     """Let neighbours follow: a screened Laplace equation, by Jacobi rounds; moved vertices keep their move.
 
@@ -28,9 +25,10 @@ def spread(
         move: Moves [m]; rows that are exactly zero are free to follow.
         neighbour_average: Averages a field over the neighbours of each vertex.
         rings: Rounds, and so the number of rings that are reached.
+        decay: Part of the neighbours' mean move that a vertex follows.
     """
     held = (move != 0).any(1)
     field = move
     for _ in range(rings if held.any() else 0):
-        field = np.where(held[:, None], move, DECAY * (neighbour_average @ field))
+        field = np.where(held[:, None], move, decay * (neighbour_average @ field))
     return field

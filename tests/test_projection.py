@@ -1,0 +1,154 @@
+"""Projection: what it clears, what it leaves alone, and that it does neither too much nor too far."""
+
+import numpy as np
+import pytest
+import trimesh
+from collision_shapes import LEFT_ARM, ball, collision, obstacle, sheet, tube
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.crossing import crossing_pairs
+from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.projection import ProjectionOptions, project
+
+
+def _sunk_tube(depth: float = 0.006) -> tuple[np.ndarray, np.ndarray]:
+    """A tube about a ball of 10 cm, cutting it by ``depth`` at the equator."""
+    return tube(0.1 - depth, low=-0.12, high=0.12)
+
+
+def _heights(vertices: np.ndarray, beneath: Obstacle) -> np.ndarray:
+    return beneath.whole(vertices).height
+
+
+def test_a_sunk_garment_comes_out_to_the_margin_and_crosses_nothing() -> None:
+    cloth, body = _sunk_tube(), obstacle(ball())
+    assert len(crossing_pairs(*cloth, *ball())) > 50
+    done = project(cloth[0], collision(cloth), [body])
+    assert done.ran
+    assert done.crossings == 0
+    assert len(crossing_pairs(done.vertices, cloth[1], *ball())) == 0
+    assert _heights(done.vertices, body).min() > 0.003 - 2e-4
+    assert done.largest_move < 0.012
+
+
+def test_a_garment_that_is_clear_is_returned_as_it_is() -> None:
+    cloth = tube(0.12)
+    done = project(cloth[0], collision(cloth), [obstacle(ball())])
+    assert not done.ran
+    assert done.rounds == 0
+    assert np.array_equal(done.vertices, cloth[0])
+
+
+def test_a_second_projection_finds_nothing_left_to_do() -> None:
+    cloth, body = _sunk_tube(), obstacle(ball())
+    once = project(cloth[0], collision(cloth), [body]).vertices
+    again = project(once, collision(cloth), [body])
+    assert again.largest_move < 5e-4
+
+
+def test_a_ridge_that_pokes_through_a_triangle_lifts_its_corners() -> None:
+    """No vertex of the coarse sheet is beneath the surface, yet a ridge cuts through its faces."""
+    coarse = sheet(6, height=0.006)
+    fine, faces = sheet(41)
+    fine[:, 1] = 0.015 * np.exp(-((fine[:, 0] / 0.004) ** 2))
+    assert len(crossing_pairs(*coarse, fine, faces)) > 10
+    # The ridge runs between two rows of the coarse sheet's vertices.
+    below = obstacle((fine, faces), margin=0.0025)
+    assert (_heights(coarse[0], below)[np.abs(coarse[0][:, 0]) < 0.03] > 0).all()
+    done = project(coarse[0], collision(coarse), [below])
+    assert len(crossing_pairs(done.vertices, coarse[1], fine, faces)) == 0
+
+
+def test_swapped_layers_are_untangled() -> None:
+    outer, inner = tube(0.100), tube(0.112)
+    below = obstacle(inner, margin=0.0025)
+    done = project(outer[0], collision(outer), [obstacle(ball(0.09)), below])
+    assert len(crossing_pairs(done.vertices, outer[1], *inner)) == 0
+    found = below.whole(done.vertices)
+    assert found.height[~found.on_border].min() > 0.002
+
+
+def test_a_long_garment_is_not_lifted_beyond_the_border_of_a_short_one() -> None:
+    outer, inner = tube(0.100, low=-0.4), tube(0.108, low=-0.05)
+    done = project(outer[0], collision(outer), [obstacle(inner)])
+    moved = np.linalg.norm(done.vertices - outer[0], axis=1)
+    assert moved[outer[0][:, 1] > 0].min() > 0.008
+    assert moved[outer[0][:, 1] < -0.32].max() < 1e-3
+
+
+def test_contact_deep_inside_another_body_part_is_left_alone() -> None:
+    """A sleeve within the torso is not the torso's: pushing it through would tear it off its arm."""
+    cloth = tube(0.02, low=-0.02, high=0.02)
+    done = project(cloth[0], collision(cloth, LEFT_ARM), [obstacle(ball())])
+    assert not done.ran
+
+
+def test_room_above_the_own_part_is_used_to_clear_another_part() -> None:
+    """A sleeve 1 cm off its arm cuts the torso by 3 mm: there is room, so it comes nearer to the arm."""
+    sleeve = tube(0.04, low=-0.03, high=0.03)
+    arm = tube(0.03)
+    torso = ball(centre=(0.137, 0, 0))
+    body_shape = (np.concatenate([arm[0], torso[0]]), np.concatenate([arm[1], torso[1] + len(arm[0])]))
+    both = collision(body_shape)
+    is_arm = np.arange(len(body_shape[0])) < len(arm[0])
+    parts = np.zeros_like(both.parts)
+    parts[is_arm, 2] = parts[~is_arm, 0] = True
+    faces_of = [np.flatnonzero(parts[both.topology.faces][:, :, k].any(1)) for k in range(6)]
+    body = Obstacle(type(both)(both.topology, parts, tuple(faces_of)), body_shape[0], margin=0.003)
+    assert len(crossing_pairs(*sleeve, *torso)) > 0
+    done = project(sleeve[0], collision(sleeve, LEFT_ARM), [body])
+    assert len(crossing_pairs(done.vertices, sleeve[1], *torso)) == 0
+    assert np.linalg.norm(done.vertices[:, [0, 2]], axis=1).min() > 0.0325
+
+
+def test_places_without_room_are_named_and_no_vertex_is_thrown_about() -> None:
+    """A collar between two balls that press together."""
+    left, right = ball(centre=(-0.09, 0, 0)), ball(centre=(0.09, 0, 0))
+    body_shape = (np.concatenate([left[0], right[0]]), np.concatenate([left[1], right[1] + len(left[0])]))
+    collar = tube(0.05, low=-0.01, high=0.01)
+    turned = collar[0][:, [1, 0, 2]] * [1, -1, 1]
+    body = obstacle(body_shape)
+    done = project(turned, collision((turned, collar[1])), [body])
+    assert body.tight.any()
+    assert done.tight.any()
+    assert np.isfinite(done.vertices).all()
+    assert done.largest_move < ProjectionOptions().longest_move + 0.02
+
+
+def test_projection_moves_with_the_scene() -> None:
+    cloth, body = _sunk_tube(), ball(centre=(0.0013, 0.0007, 0.0021))  # no ties between equally near places
+    here = project(cloth[0], collision(cloth), [obstacle(body)]).vertices
+    motion = trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.7, 0.2]))
+    turn, shift = motion[:3, :3], np.array([1.0, 2.0, -3.0])
+
+    def there(points: np.ndarray) -> np.ndarray:
+        return points @ turn.T + shift
+
+    moved = project(there(cloth[0]), collision(cloth), [obstacle((there(body[0]), body[1]))]).vertices
+    np.testing.assert_allclose(moved, there(here), atol=1e-6)
+
+
+def test_spreading_keeps_a_single_push_from_standing_out() -> None:
+    cloth, faces = sheet(21)
+    cloth[:, 1] = 0.02
+    spike, spike_faces = ball(0.012, centre=(0, 0.012, 0))
+    body = (spike, spike_faces)
+
+    def slope(options: ProjectionOptions) -> float:
+        done = project(cloth, collision((cloth, faces)), [obstacle(body)], options)
+        edges = done.vertices[faces] - done.vertices[np.roll(faces, 1, axis=1)]
+        return float(np.abs(edges[..., 1]).max())
+
+    assert slope(ProjectionOptions()) < 0.85 * slope(ProjectionOptions(spread=0))
+
+
+def test_bad_input_is_refused() -> None:
+    cloth = tube(0.12)
+    broken = cloth[0].copy()
+    broken[3] = np.nan
+    with pytest.raises(GeometryError, match="NaN"):
+        project(broken, collision(cloth), [obstacle(ball())])
+    with pytest.raises(GeometryError, match="rounds"):
+        ProjectionOptions(rounds=0)
+    with pytest.raises(GeometryError, match="margin"):
+        obstacle(ball(), margin=-0.1)

@@ -1,0 +1,45 @@
+"""Tucking: a wide inner garment gives way, everything else stays."""
+
+import numpy as np
+import pytest
+from collision_shapes import LEFT_ARM, collision, obstacle, tube
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.tuck import GIVE, tuck
+
+
+def _radius(vertices: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vertices[:, [0, 2]], axis=1)
+
+
+def test_a_wide_hem_is_drawn_in_under_the_cover_and_the_rest_follows_smoothly() -> None:
+    shirt, trousers = tube(0.15, low=-0.3, high=0.3), tube(0.1, low=-0.4, high=0.0)
+    after = tuck(shirt[0], collision(shirt), [obstacle(trousers)])
+    radius = _radius(after)
+    under = shirt[0][:, 1] < -0.02
+    assert radius[under].max() < 0.1 + GIVE + 5e-4
+    assert radius[shirt[0][:, 1] > 0.28].min() > 0.145  # the far end hardly moves
+    profile = radius.reshape(21, -1).mean(1)
+    above = profile[shirt[0].reshape(21, -1, 3)[:, 0, 1] >= 0]
+    assert (np.diff(above) > -1e-9).all()  # it widens steadily from the waist up
+    assert np.abs(np.diff(profile)).max() < 0.02
+
+
+def test_what_stands_out_no_further_than_it_may_is_left_alone() -> None:
+    inner, outer = tube(0.1 + 0.9 * GIVE), tube(0.1, low=-0.3, high=0.3)
+    assert tuck(inner[0], collision(inner), [obstacle(outer)]) is inner[0]
+    assert tuck(outer[0], collision(outer), [obstacle(inner)]) is outer[0]  # lies beneath already
+    assert tuck(inner[0], collision(inner), []) is inner[0]
+
+
+def test_garments_of_different_parts_or_far_apart_do_not_meet() -> None:
+    inner, outer = tube(0.15), tube(0.1, low=-0.3, high=0.3)
+    assert tuck(inner[0], collision(inner, LEFT_ARM), [obstacle(outer)]) is inner[0]
+    wide = tube(0.3)
+    assert tuck(wide[0], collision(wide), [obstacle(outer)]) is wide[0]
+
+
+def test_negative_give_is_refused() -> None:
+    inner = tube(0.1)
+    with pytest.raises(GeometryError, match="give"):
+        tuck(inner[0], collision(inner), [], give=-1.0)
