@@ -104,7 +104,7 @@ class GarmentBundle:
             BundleError: If provenance or metrics hold what JSON cannot keep.
         """
         model = self.model
-        networks = {f"panel_field.{side}": model.panel_fields[side] for side in PANELS}
+        networks: dict[str, Any] = {f"panel_field.{side}": model.panel_fields[side] for side in PANELS}
         networks |= {f"atlas.{side}": model.atlases[side] for side in PANELS}
         if self.drape_field is not None:
             networks["drape_field"] = self.drape_field
@@ -238,7 +238,7 @@ def _unpack(network: nn.Module, name: str, tensors: Mapping[str, Tensor]) -> Any
 def _save_network(
     path: str | os.PathLike,
     kind: tuple[str, int],
-    network: nn.Module,
+    network: Any,
     dtype: Precision,
     manifest: dict[str, Any],
 ) -> None:

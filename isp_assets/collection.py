@@ -23,9 +23,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from isp_assets.fabric_style import FabricStyle
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import CollectionError, InputError
+from isp_assets.fabric_style import FabricStyle
 from isp_assets.outfit import Outfit, OutfitItem
 from isp_assets.toml_file import check_keys, read_toml
 

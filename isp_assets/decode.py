@@ -172,11 +172,18 @@ def lift_points(
 
 
 def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) -> Float[Tensor, "V 3"]:
-    """Vertex positions: the mean of all panel points that share a vertex."""
+    """Vertex positions: seam vertices halfway between both panels, their surroundings following smoothly."""
     index = torch.from_numpy(np.concatenate([p.vertex_index for p in sewn.panels.values()]))
     points = torch.cat([lifted[side] for side in sewn.panels])
     total = points.new_zeros(sewn.num_vertices, 3).index_add(0, index, points)
-    return total / torch.bincount(index, minlength=sewn.num_vertices)[:, None]
+    welded = total / torch.bincount(index, minlength=sewn.num_vertices)[:, None]
+    for side, panel in sewn.panels.items():
+        fade, vertex = sewn.fades[side], torch.from_numpy(panel.vertex_index)
+        move = welded[vertex] - lifted[side]  # zero but on the seams
+        weights = torch.from_numpy(fade.weights).to(move)
+        follow = (weights[..., None] * move[torch.from_numpy(fade.sources)]).sum(dim=1)
+        welded = welded.index_add(0, vertex[torch.from_numpy(fade.points)], follow)
+    return welded
 
 
 def _follow_border(

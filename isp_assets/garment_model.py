@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -44,7 +44,8 @@ class GarmentModel:
                 raise BundleError(
                     f"category {self.category!r}: {what} must be keyed {PANELS}, got {tuple(networks)}"
                 )
-        sizes = {net.config.code_size for net in (*self.panel_fields.values(), *self.atlases.values())}
+        both: Any = [*self.panel_fields.values(), *self.atlases.values()]
+        sizes = {network.config.code_size for network in both}
         if len(sizes) != 1:
             raise BundleError(
                 f"category {self.category!r}: networks disagree on the code size: {sorted(sizes)}"

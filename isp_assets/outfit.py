@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from isp_assets.fabric_style import FabricStyle
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import OutfitError
+from isp_assets.fabric_style import FabricStyle
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from isp_assets.errors import PluginError
 from isp_assets.frames import FrameChunk, Scene
@@ -105,7 +105,7 @@ def _load_file(file: Path) -> FoundPlugin:
         return FoundPlugin(file.stem, str(file), "?", error=f"{type(error).__name__}: {error}")
 
 
-def _checked(name: str, origin: str, writer: type) -> FoundPlugin:
+def _checked(name: str, origin: str, writer: Any) -> FoundPlugin:
     missing = [
         m for m in ("name", "suffix", "version", "begin", "add", "finish", "abort") if not hasattr(writer, m)
     ]

@@ -84,7 +84,7 @@ def load_tensors(
         raise BundleError(f"{path}: the manifest is not JSON ({error}); the file is damaged") from error
     _check_kind(path, manifest, schema, version)
     for old in range(manifest["version"], version):
-        if old not in (upgrades or {}):
+        if upgrades is None or old not in upgrades:
             raise BundleError(f"{path}: version {old} of {schema!r} cannot be upgraded; train it again")
         manifest, tensors = upgrades[old](manifest, tensors)
         manifest["version"] = old + 1

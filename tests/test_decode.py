@@ -128,8 +128,22 @@ def test_seam_vertices_are_the_mean_of_both_lifts(skirt):
     assert report.seam_gap_max == pytest.approx(0.2)
     sewn = np.unique(np.concatenate([garment.panels["front"].vertex_index[s.front] for s in garment.seams]))
     np.testing.assert_allclose(garment.rest_vertices[sewn, 2], 0, atol=1e-7)
-    other = np.setdiff1d(np.arange(garment.num_vertices), sewn)
-    np.testing.assert_allclose(np.abs(garment.rest_vertices[other, 2]), 0.1, atol=1e-7)
+
+
+def test_the_inside_follows_its_seams_and_is_free_far_from_them(skirt):
+    garment = decode_garment(skirt, ZERO, resolution=64)
+    front = garment.panels["front"]
+    height = garment.rest_vertices[front.vertex_index, 2]
+    # Distance from the slanting side seams of the skirt.
+    across = (
+        (0.3 + 0.3 * (0.6 - front.panel_xy[:, 1]) / 1.3 - np.abs(front.panel_xy[:, 0]))
+        * 1.3
+        / np.hypot(1.3, 0.3)
+    )
+    np.testing.assert_allclose(height[across > 0.16], 0.1, atol=1e-7)
+    middle = np.abs(front.panel_xy[:, 1]) < 0.4
+    expected = 0.1 * (1 - np.clip(1 - across / 0.15, 0, 1) ** 2)
+    np.testing.assert_allclose(height[middle], expected[middle], atol=2e-3)
 
 
 def test_the_band_is_a_small_share_of_the_grid(shirt):

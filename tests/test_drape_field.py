@@ -55,7 +55,7 @@ def test_folded_basis_equals_sampling_the_maps() -> None:
 
 
 def test_resolution_mismatch_is_refused() -> None:
-    with pytest.raises(DrapeError, match="16 texels, the sampler 8"):
+    with pytest.raises(DrapeError, match="16 texels, the sampler of 8"):
         bind_displacement(_trained(), _sampler(8), np.ones(1, np.float32))
 
 

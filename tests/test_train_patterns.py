@@ -71,9 +71,11 @@ def test_parts_of_different_runs_are_refused(trained, tmp_path):
 
 def test_resuming_pattern_training_is_exact(tmp_path):
     dataset, options = tube_dataset(), PATTERNS
-    train_patterns(dataset, tmp_path / "whole", run=RunOptions(steps=6, hold=1.0), options=options)
+    train_patterns(
+        dataset, tmp_path / "whole", run=RunOptions(steps=6, hold=1.0, measurements=1), options=options
+    )
     for steps in (3, 6):
-        run = RunOptions(steps=steps, hold=1.0, resume=True)
+        run = RunOptions(steps=steps, hold=1.0, measurements=1, resume=True)
         train_patterns(dataset, tmp_path / "parts", run=run, options=options)
     whole, parts = (read_checkpoint(tmp_path / name / CHECKPOINT)[0] for name in ("whole", "parts"))
     assert all(torch.equal(whole[name], parts[name]) for name in whole)

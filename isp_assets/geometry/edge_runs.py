@@ -126,7 +126,7 @@ def _log_probability(logits: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n K
 def _smooth(values: Float[np.ndarray, "n K"], reach: int) -> Float[np.ndarray, "n K"]:
     """Mean over ``2 reach + 1`` neighbours on a closed curve."""
     reach = min(reach, (len(values) - 1) // 2)
-    return sum(np.roll(values, shift, axis=0) for shift in range(-reach, reach + 1)) / (2 * reach + 1)
+    return np.mean([np.roll(values, shift, axis=0) for shift in range(-reach, reach + 1)], axis=0)
 
 
 def _merge_short(evidence: Float[np.ndarray, "n K"], shortest: int):

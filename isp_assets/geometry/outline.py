@@ -12,6 +12,7 @@ Implicit Sewing Patterns", NeurIPS 2023, "Meshing and Preserving Differentiabili
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from contourpy import contour_generator
@@ -145,7 +146,7 @@ def _zero_loops(values: Float[np.ndarray, "n n"]) -> tuple[list[Float[np.ndarray
     if not np.isfinite(values).all():
         raise GeometryError("the panel field gives NaN or infinity")
     axis = np.linspace(-1.0, 1.0, len(values))
-    lines = contour_generator(axis, axis, values).lines(0.0)
+    lines = cast(list[np.ndarray], contour_generator(axis, axis, values).lines(0.0))
     if not lines:
         raise GeometryError(
             "the panel field has no inside" if values[0, 0] > 0 else "the panel covers its whole square"

@@ -7,6 +7,7 @@ Both sides of a seam get equally many points, at equal shares of their lengths.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,10 +17,12 @@ from isp_assets.conventions import PANELS
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.edge_runs import EdgeRun, dissolve, join_alike
 from isp_assets.geometry.outline import resample_open
+from isp_assets.geometry.seam_fade import SeamFade, seam_fade
 from isp_assets.geometry.topology import edges, weld
 from isp_assets.geometry.triangulate import triangulate_panel
 
 Loop = tuple[EdgeRun, ...]
+_NONE = np.empty(0, dtype=np.int64)
 _MIN_EDGES = 2
 """Fewest edges on a run: with one, the two sides of a short opening would close it."""
 
@@ -61,6 +64,15 @@ class SewnPanels:
     def faces(self) -> Int[np.ndarray, "F 3"]:
         """Triangles over sewn vertices, front first."""
         return np.concatenate([p.vertex_index[p.faces] for p in self.panels.values()])
+
+    @cached_property
+    def fades(self) -> dict[str, SeamFade]:
+        """By panel, how its inside follows its seams."""
+        fades = {}
+        for side, panel in self.panels.items():
+            sewn = [seam.front if side == "front" else seam.back for seam in self.seams]
+            fades[side] = seam_fade(panel.points, np.unique(np.concatenate([*sewn, _NONE])))
+        return fades
 
 
 @dataclass(frozen=True)
@@ -196,8 +208,8 @@ def _triangulate(
     sewn = np.zeros(len(points), dtype=bool)
     first_run = np.cumsum([0, *map(len, loops)])
     for match in matches:
-        loop, run = match.front if side == "front" else match.back
-        sewn[runs[first_run[loop] + run][1]] = True
+        piece, position = match.front if side == "front" else match.back
+        sewn[runs[first_run[piece] + position][1]] = True
     points, faces = split_chords(points, faces, sewn)
     border_label = np.concatenate([*labels, np.zeros(len(points) - start, dtype=np.int64)])
     if side == "back":

@@ -39,7 +39,7 @@ class DrapeFieldConfig:
     map_size: int = 64
     """Texels R along a side of a map."""
     coarse_size: int = 16
-    """Texels of a coarse map that is enlarged and added to each, so that what is learnt spreads; 0 for none."""
+    """Texels of a coarse map that is enlarged and added to each, which spreads what is learnt; 0 for none."""
     displacement_scale: float = 0.05
     """Factor on the maps [m]."""
     code_scale: float = 1.0
@@ -75,7 +75,7 @@ class DrapeField(nn.Module):
             parts, config.basis, width=config.width, depth=config.depth, skip=config.skip,
             activation=config.activation,
         )  # fmt: skip
-        # The last map is the mean. Texels that no training garment covers keep what they start with: smooth maps.
+        # The last map is the mean. Texels that no garment covers keep the smooth maps they start with.
         coarse = (
             torch.randn(config.basis + 1, 6, *(config.coarse_size or size // 4,) * 2) * config.basis**-0.5
         )
@@ -85,8 +85,8 @@ class DrapeField(nn.Module):
             self.fine = nn.Parameter(torch.zeros(config.basis + 1, 6, size, size))
         else:
             self.fine = nn.Parameter(_enlarged(coarse, size))
-        nn.init.zeros_(self.mlp.layers[-1].weight)
-        nn.init.zeros_(self.mlp.layers[-1].bias)
+        for parameter in self.mlp.layers[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def coefficients(self, features: Float[Tensor, "T F"]) -> Float[Tensor, "T K"]:
         """Coefficients of the fixed maps.
@@ -100,7 +100,7 @@ class DrapeField(nn.Module):
 
     def maps(self) -> tuple[Float[Tensor, "K 6 R R"], Float[Tensor, "6 R R"]]:
         """The fixed maps and the mean map [m]; channels 0-2 are the front panel, 3-5 the back."""
-        texels = self.fine
+        texels: Tensor = self.fine
         if self.config.coarse_size:
             texels = texels + _enlarged(self.coarse, self.config.map_size)
         texels = self.config.displacement_scale * texels

@@ -93,7 +93,7 @@ class LayeringNet(nn.Module):
         else:
             self.head = nn.Conv2d(config.features, 6, 1)
             nn.init.zeros_(self.head.weight)
-            nn.init.zeros_(self.head.bias)
+            nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, maps: Float[Tensor, "B 18 R R"]) -> Float[Tensor, "B 6 R R"]:
         """Displacement maps, in the units of ``config.displacement_scale``."""
@@ -126,9 +126,10 @@ class _Block(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         for channels in (inputs, outputs):
-            layers.append(nn.Conv2d(channels, outputs, 3, padding=1))
-            nn.init.kaiming_normal_(layers[-1].weight, nonlinearity="relu")
-            nn.init.zeros_(layers[-1].bias)
+            convolution = nn.Conv2d(channels, outputs, 3, padding=1, bias=True)
+            nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+            layers.append(convolution)
             if norm == "instance":
                 layers.append(nn.InstanceNorm2d(outputs))
             layers.append(nn.SiLU())

@@ -7,6 +7,7 @@ frequency to draw sharp corners; SiLU or unscaled inputs leave about three times
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -44,7 +45,7 @@ class Mlp(nn.Module):
         self.input_sizes, self.skip = tuple(inputs), skip
         self.activation, self.activate_last = activation, activate_last
         total = sum(self.input_sizes)
-        layers = []
+        layers: list[nn.Linear] = []
         for index in range(depth):
             size = total if index == 0 else width + (total if index == skip else 0)
             layer = nn.Linear(size, outputs if index == depth - 1 else width)
@@ -71,7 +72,7 @@ class Mlp(nn.Module):
                 return nn.functional.silu(x)
 
 
-def _linear(layer: nn.Linear, parts: Sequence[Tensor]) -> Tensor:
+def _linear(layer: Any, parts: Sequence[Tensor]) -> Tensor:
     """``layer(cat(parts))`` with broadcasting and without the concatenation."""
     if len(parts) == 1:
         return layer(parts[0])

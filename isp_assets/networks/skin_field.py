@@ -92,9 +92,9 @@ class SkinField(nn.Module):
             self._start_at_kernel()
 
     def _start_at_kernel(self) -> None:
-        last = self.trunk.layers[-1]
+        bias = self.trunk.layers[-1].get_parameter("bias")
         with torch.no_grad():
-            last.bias[-1] = torch.log(torch.tensor(_FIRST_WIDTH))
+            bias[-1] = torch.log(torch.tensor(_FIRST_WIDTH))
             if self.config.rank:
                 self.head.weight.zero_()
                 self.head.bias.zero_()

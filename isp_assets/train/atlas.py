@@ -133,10 +133,10 @@ def _atlas_config(dataset: GarmentDataset, side: str, options: AtlasOptions, cod
     xy = np.concatenate([network_xy(dataset, garment, side) for garment in dataset.garments])
     place = np.concatenate([places(garment, side) for garment in dataset.garments])
     fitted, *_ = np.linalg.lstsq(np.column_stack([xy, np.ones(len(xy))]), place, rcond=None)
-    rows = [tuple(float(np.float32(v)) for v in row) for row in fitted.T]
+    rows = [[float(np.float32(v)) for v in row] for row in fitted.T]
     return AtlasConfig(
         code_size=code_size, width=options.width, depth=options.depth, skip=options.skip,
-        offset=tuple(row[2] for row in rows), slope=tuple(row[:2] for row in rows),
+        offset=(rows[0][2], rows[1][2], rows[2][2]), slope=tuple((row[0], row[1]) for row in rows),
     )  # fmt: skip
 
 

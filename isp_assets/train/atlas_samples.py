@@ -21,7 +21,8 @@ def places(garment: TrainingGarment, side: str) -> Float[np.ndarray, "P 3"]:
 
 def seam_indices(garment: TrainingGarment) -> dict[str, Int[np.ndarray, " n"]]:
     """By panel, the points that share a vertex with the other panel, in matching order."""
-    _, *points = np.intersect1d(*(garment.panels[side].vertex_index for side in PANELS), return_indices=True)
+    front, back = (garment.panels[side].vertex_index for side in PANELS)
+    _, *points = np.intersect1d(front, back, return_indices=True)
     return dict(zip(PANELS, points, strict=True))
 
 

@@ -22,7 +22,14 @@ from jaxtyping import Float, Int
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import DatasetError
-from isp_assets.train.garment_maker import CATEGORIES, FILE_VERSION, UNREADABLE, GarmentMaker, Recipe
+from isp_assets.train.garment_maker import (
+    CATEGORIES,
+    FILE_VERSION,
+    UNREADABLE,
+    GarmentMaker,
+    Recipe,
+    read_garment_file,
+)
 from isp_assets.train.worker_pool import run_tasks
 
 Progress = Callable[[int, int, str], None]
@@ -182,9 +189,7 @@ def read_index(folder: Path) -> dict:
 
 def _load_garment(path: Path) -> TrainingGarment:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        meta = json.loads(str(arrays.pop("meta")))
+        arrays, meta = read_garment_file(path)
     except UNREADABLE as error:
         raise DatasetError(
             f"{path} is missing or damaged ({error}); run make_dataset on the folder again"
@@ -226,7 +231,7 @@ def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, counts: Mapping
         if name not in counts:
             continue
         paths = [maker.path(name, index) for index in range(counts[name])]
-        metas = [maker.read_meta(path) for path in paths]
+        metas = [read_garment_file(path)[1] for path in paths]
         categories[name] = {
             "files": [path.name for path in paths],
             "edge_names": {str(label): text for label, text in category.edge_names.items()},

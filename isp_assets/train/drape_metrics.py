@@ -96,7 +96,7 @@ def minimise(
 
     def energy(unknown: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.tensor(unknown, device=device).reshape(start.shape).requires_grad_(True)
-        total = sum(case.energies((start + scale * x)[None]).values()).sum()
+        total = torch.cat(list(case.energies((start + scale * x)[None]).values())).sum()
         (gradient,) = torch.autograd.grad(total, x)
         return float(total.detach()), gradient.cpu().numpy().reshape(-1)
 

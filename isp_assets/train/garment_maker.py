@@ -42,6 +42,14 @@ class Recipe:
     edge_length: float
 
 
+def read_garment_file(path: Path) -> tuple[dict[str, np.ndarray], dict]:
+    """Arrays and JSON part of a garment's file; raises one of ``UNREADABLE`` if it is not whole."""
+    # numpy leaves a file that it opened itself open where it is damaged.
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        arrays = dict(file)
+    return arrays, json.loads(str(arrays.pop("meta")))
+
+
 class GarmentMaker:
     """Makes the garments of a recipe, each from its category and index alone."""
 
@@ -90,7 +98,7 @@ class GarmentMaker:
         """
         path = self.path(category, index)
         try:
-            meta = self.read_meta(path)
+            meta = read_garment_file(path)[1]
         except UNREADABLE:
             return False
         expected = self._provenance()
@@ -100,12 +108,6 @@ class GarmentMaker:
                 f"expected {expected}, version {FILE_VERSION}; choose another folder"
             )
         return True
-
-    @staticmethod
-    def read_meta(path: Path) -> dict:
-        """The JSON part of a garment's file; every array is read, so a damaged file raises."""
-        with np.load(path, allow_pickle=False) as file:
-            return json.loads(str({key: file[key] for key in file.files}["meta"]))
 
     def make(self, category: str, index: int) -> str:
         """Make one garment and its file; rejected drafts are drawn again and counted.

@@ -133,10 +133,10 @@ class LayeringTask:
         """Drape a random stack, innermost first, and make all but the outermost garment final."""
         posed = self.body.pose(poses.to(self.device), betas=betas.to(self.device))
         beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
-        layers = 3 if float(torch.rand((), generator=generator)) < self.options.deep_share else 2
-        chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (layers,), generator=generator)]
+        depth = 3 if float(torch.rand((), generator=generator)) < self.options.deep_share else 2
+        chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (depth,), generator=generator)]
         layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen])
-        inner = []
+        inner: list[tuple[Any, Tensor]] = []
         for wearer, vertices in zip(chosen[:-1], layers[:-1], strict=True):
             if inner:
                 vertices, _ = correct_layer(wearer.layering, vertices, beneath, posed, ramp=wearer.ramp)

@@ -33,7 +33,7 @@ def _frame(stack: "Stack", lifted: Tensor, body: Body, frame: int) -> dict[str, 
         positions = vertices[frame].double().cpu().numpy()
         topology = SurfaceTopology.build(wearer.rest.faces.cpu().numpy(), len(positions))
         surfaces.append(Beneath(positions, topology, closed=False))
-    figures = {}
+    figures: dict[str, float] = {}
     faces = stack.wearer.rest.faces.cpu().numpy()
     for when, vertices in (("before", stack.draped), ("after", lifted)):
         positions = vertices[frame].double().cpu().numpy()

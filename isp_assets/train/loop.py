@@ -34,8 +34,10 @@ class Task(Protocol):
     name: str
     config: Mapping[str, Any]
     """Plain JSON values that a checkpoint must share with the task that resumes it."""
-    module: nn.Module
-    """Owns every parameter."""
+
+    @property
+    def module(self) -> nn.Module:
+        """Owns every parameter."""
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Groups for Adam, each with its peak ``lr``."""
@@ -77,7 +79,7 @@ class RunOptions:
 
     def progress(self, step: int, seconds: float) -> float:
         """Share of the budget that is spent, 0 to 1."""
-        spent = step / self.steps if self.steps else seconds / (60 * self.minutes)
+        spent = step / self.steps if self.steps else seconds / (60 * (self.minutes or 1))
         return min(spent, 1.0)
 
     def rate(self, progress: float) -> float:

@@ -84,8 +84,9 @@ class SkinTask:
 
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
         """Squared log ratio of the kernel widths; with a head, also the cross-entropy of the weights."""
-        config, terms = self.module.config, {}
-        width_loss, entropy = 0.0, 0.0
+        config = self.module.config
+        terms: dict[str, Tensor] = {}
+        width_loss, entropy = torch.zeros(()), torch.zeros(())
         for rest, pool in enumerate(self.pools):
             if config.kernel:
                 batch = pool.take(torch.randint(len(pool.points), (4096,), generator=generator))

@@ -28,7 +28,7 @@ WRITERS = ("usd", "glb", "rerun", "sheet")
 
 
 def measure(layers: int, chunk: int, frames: int, resolution: int, writers: bool) -> dict[str, Any]:
-    """One row, in this process: load, prepare, the first chunk (cold), the other chunks (warm), the writers."""
+    """One row, in this process: load, prepare, first chunk (cold), other chunks (warm), writers."""
     seconds: dict[str, float] = {}
     start = time.perf_counter()
     import torch
