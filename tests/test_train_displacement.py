@@ -178,9 +178,10 @@ def options() -> DisplacementOptions:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _tolerate_pillows() -> Iterator[None]:
+def _tolerate_pillows_and_be_quick() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wardrobe, "_MAX_STRAIN", 99.0)
+        patch.setattr(displacement, "_TEST_FRAMES", 2)
         yield
 
 
