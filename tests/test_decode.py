@@ -143,7 +143,7 @@ def test_the_inside_follows_its_seams_and_is_free_far_from_them(skirt):
     np.testing.assert_allclose(height[across > 0.16], 0.1, atol=1e-7)
     middle = np.abs(front.panel_xy[:, 1]) < 0.4
     expected = 0.1 * (1 - np.clip(1 - across / 0.15, 0, 1) ** 2)
-    np.testing.assert_allclose(height[middle], expected[middle], atol=2e-3)
+    np.testing.assert_allclose(height[middle], expected[middle], atol=6e-3)
 
 
 def test_the_band_is_a_small_share_of_the_grid(shirt):
