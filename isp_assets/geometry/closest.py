@@ -12,6 +12,7 @@ Weighted Pseudonormal", 2005.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import igl
 import numpy as np
@@ -33,9 +34,6 @@ class SurfaceTopology:
     face_edge: Int[np.ndarray, "F 3"]
     """Edge opposite to each corner of a face."""
     border_vertex: Bool[np.ndarray, " V"]
-    corner_start: Int[np.ndarray, " V_plus_1"]
-    corners: Int[np.ndarray, " C"]
-    """Corners (3 * face + k) around vertex ``v``: from ``corner_start[v]`` to ``corner_start[v + 1]``."""
 
     @classmethod
     def build(cls, faces: Int[np.ndarray, "F 3"], num_vertices: int) -> "SurfaceTopology":
@@ -60,10 +58,8 @@ class SurfaceTopology:
         edge_faces[double, 1] = order[first[double] + 1] // 3
         border = np.zeros(num_vertices, bool)
         border[mesh.vertices[~double]] = True
-        corners = np.argsort(faces.reshape(-1), kind="stable")
-        start = np.concatenate([[0], np.bincount(faces.reshape(-1), minlength=num_vertices).cumsum()])
         opposite = np.roll(mesh.face_edge, -1, axis=1)
-        return cls(faces, edge_faces, opposite, border, start, corners)
+        return cls(faces, edge_faces, opposite, border)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +78,37 @@ class Closest:
     """The closest point lies on the open border of the surface: the sign means nothing."""
 
 
+class SurfaceNormals:
+    """Normals of a surface in one frame; made once, shared by queries."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        self._vertices, self._faces = vertices, faces
+
+    @cached_property
+    def of_faces(self) -> Float[np.ndarray, "F 3"]:
+        """Unit normals; zero for a face without area."""
+        return unit_face_normals(self._vertices, self._faces)
+
+    @cached_property
+    def of_vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Unit sums of the face normals around each vertex, weighted by the faces' angles there."""
+        corner = self._vertices[self._faces]
+        side = np.roll(corner, -1, axis=1) - corner
+        side /= np.maximum(np.sqrt(np.einsum("fkc,fkc->fk", side, side)), 1e-30)[..., None]
+        cosine = -np.einsum("fkc,fkc->fk", side, np.roll(side, 1, axis=1))
+        weighted = np.arccos(cosine.clip(-1, 1))[..., None] * self.of_faces[:, None]
+        total = np.stack(
+            [
+                np.bincount(
+                    self._faces.reshape(-1), weighted[..., axis].reshape(-1), minlength=len(self._vertices)
+                )
+                for axis in range(3)
+            ],
+            axis=1,
+        )
+        return total / np.maximum(np.sqrt(np.einsum("vc,vc->v", total, total)), 1e-12)[:, None]
+
+
 class ClosestQuery:
     """A surface in one frame, ready for closest-point queries (a tree of boxes, built once, used often)."""
 
@@ -91,7 +118,7 @@ class ClosestQuery:
         topology: SurfaceTopology,
         *,
         subset: Int[np.ndarray, " n"] | None = None,
-        face_normals: Float[np.ndarray, "F 3"] | None = None,
+        normals: SurfaceNormals | None = None,
     ) -> None:
         """Build the tree.
 
@@ -99,7 +126,7 @@ class ClosestQuery:
             vertices: Positions in this frame [m].
             topology: Connectivity.
             subset: Search these faces only; sides and borders remain those of the whole surface.
-            face_normals: Unit normals of all faces, where the caller has them already.
+            normals: Normals of the whole surface, where the caller has them already.
 
         Raises:
             GeometryError: If the positions do not fit the topology or are not finite.
@@ -115,9 +142,7 @@ class ClosestQuery:
         self._searched = topology.faces if subset is None else np.ascontiguousarray(topology.faces[subset])
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self._searched)
-        self.face_normals = (
-            unit_face_normals(self.vertices, topology.faces) if face_normals is None else face_normals
-        )
+        self.normals = normals or SurfaceNormals(self.vertices, topology.faces)
 
     def __call__(self, points: Float[np.ndarray, "P 3"]) -> Closest:
         """Closest point, side and pseudonormal of every query point."""
@@ -137,41 +162,24 @@ class ClosestQuery:
     def _pseudonormals(
         self, face: Int[np.ndarray, " P"], weights: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
-        topology = self.topology
+        topology, of_faces = self.topology, self.normals.of_faces
         zero = weights < _ON_FEATURE
         zeros = zero[:, 0].astype(np.int8) + zero[:, 1] + zero[:, 2]
-        normal = self.face_normals[face]
+        normal = of_faces[face]
         on_border = np.zeros(len(face), bool)
         on_edge = np.flatnonzero(zeros == 1)
-        edge = topology.face_edge[face[on_edge], zero[on_edge].argmax(1)]
-        pair = topology.edge_faces[edge]
+        pair = topology.edge_faces[topology.face_edge[face[on_edge], zero[on_edge].argmax(1)]]
         on_border[on_edge] = pair[:, 1] < 0
         across = np.where(pair[:, 0] == face[on_edge], pair[:, 1], pair[:, 0])
-        normal[on_edge] += np.where(across[:, None] >= 0, self.face_normals[across], 0)
+        sum_of_two = normal[on_edge] + np.where(across[:, None] >= 0, of_faces[across], 0)
+        length = np.sqrt(np.einsum("pc,pc->p", sum_of_two, sum_of_two))[:, None]
+        # Where a fold closes to 180 degrees any side is as good: keep the face's.
+        normal[on_edge] = np.where(length > 1e-9, sum_of_two / np.maximum(length, 1e-9), normal[on_edge])
         on_vertex = np.flatnonzero(zeros == 2)
         vertex = topology.faces[face[on_vertex], weights[on_vertex].argmax(1)]
         on_border[on_vertex] = topology.border_vertex[vertex]
-        if len(on_vertex):
-            unique, inverse = np.unique(vertex, return_inverse=True)
-            normal[on_vertex] = self._vertex_normals(unique)[inverse.reshape(-1)]
-        length = np.sqrt(np.einsum("pc,pc->p", normal, normal))[:, None]
-        flat = length[:, 0] < 1e-12  # a fold of 180 degrees: any side is as good, keep the face's
-        normal[flat] = self.face_normals[face[flat]]
-        return normal / np.where(flat[:, None], 1.0, length), on_border
-
-    def _vertex_normals(self, vertex: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Angle-weighted sums of face normals, not normalised."""
-        topology = self.topology
-        start, stop = topology.corner_start[vertex], topology.corner_start[vertex + 1]
-        owner = np.repeat(np.arange(len(vertex)), stop - start)
-        place = np.arange(len(owner)) - np.repeat(np.cumsum(stop - start) - (stop - start), stop - start)
-        corner = topology.corners[np.repeat(start, stop - start) + place]
-        face, k = corner // 3, corner % 3
-        here, following, before = (self.vertices[topology.faces[face, (k + i) % 3]] for i in range(3))
-        a, b = following - here, before - here
-        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
-        weighted = self.face_normals[face] * angle[:, None]
-        return np.stack([np.bincount(owner, weighted[:, i], minlength=len(vertex)) for i in range(3)], axis=1)
+        normal[on_vertex] = self.normals.of_vertices[vertex]
+        return normal, on_border
 
 
 def unit_face_normals(

@@ -78,8 +78,8 @@ class Beneath:
         """Vertices of a body above which cloth finds no room: creases, and parts that press together."""
         if not self.closed:
             return np.zeros(len(self.vertices), bool)
-        normals = igl.per_vertex_normals(self.vertices, self.topology.faces)
-        return self._winding.winding_number(self.vertices + _ROOM * normals).reshape(-1) > 0.5
+        probe = self.vertices + _ROOM * self.closest.normals.of_vertices
+        return self._winding.winding_number(probe).reshape(-1) > 0.5
 
     def depth(
         self, points: Float[np.ndarray, "P 3"]

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceTopology, unit_face_normals
+from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceNormals, SurfaceTopology
 
 BODY_PARTS: dict[str, tuple[int, ...]] = {
     "torso": (0, 3, 6, 9, 13, 14),
@@ -107,21 +107,13 @@ class Obstacle:
         self._queries: dict[int, ClosestQuery] = {}
 
     @cached_property
-    def face_normals(self) -> Float[np.ndarray, "F 3"]:
-        return unit_face_normals(self.vertices, self.mesh.topology.faces)
+    def normals(self) -> SurfaceNormals:
+        return SurfaceNormals(self.vertices, self.mesh.topology.faces)
 
     @cached_property
     def whole(self) -> ClosestQuery:
         """All parts at once."""
-        return ClosestQuery(self.vertices, self.mesh.topology, face_normals=self.face_normals)
-
-    @cached_property
-    def vertex_normals(self) -> Float[np.ndarray, "V 3"]:
-        """Unit sums of the face normals around each vertex."""
-        faces, count = self.mesh.topology.faces.reshape(-1), len(self.vertices)
-        normals = np.repeat(self.face_normals, 3, axis=0)
-        total = np.stack([np.bincount(faces, normals[:, k], minlength=count) for k in range(3)], axis=1)
-        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+        return ClosestQuery(self.vertices, self.mesh.topology, normals=self.normals)
 
     @cached_property
     def tight(self) -> Bool[np.ndarray, " V"]:
@@ -130,7 +122,7 @@ class Obstacle:
         A probe twice the margin above the vertex comes nearer to another place of the surface.
         Nothing can lie there without cutting the surface, so it is neither lifted hard nor blamed.
         """
-        probe = self.whole(self.vertices + 2 * self.margin * self.vertex_normals)
+        probe = self.whole(self.vertices + 2 * self.margin * self.normals.of_vertices)
         return probe.height < 0.6 * self.margin
 
     @cached_property
@@ -177,7 +169,7 @@ class Obstacle:
                 self.vertices,
                 self.mesh.topology,
                 subset=self.mesh.part_faces[part],
-                face_normals=self.face_normals,
+                normals=self.normals,
             )
         return self._queries[part]
 

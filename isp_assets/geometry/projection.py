@@ -31,7 +31,8 @@ LAYER_MARGIN = 0.0025
 
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
-_WATCHED = 0.02  # vertices this near [m] at the start are looked at again in every round
+_AROUND = 0.015  # vertices this near [m] at the start make the surface around them a neighbour
+_WATCHED = 0.008  # vertices this near [m] at the start are looked at again in every round
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _FINISH_STEP = 0.004  # largest lift [m] of one such correction
 _MOST_RINGS = 8
@@ -115,13 +116,15 @@ class _Neighbour:
     def __init__(self, obstacle: Obstacle, found: Closest, *, edge: float) -> None:
         self.obstacle = obstacle
         topology = obstacle.mesh.topology
-        near = np.abs(found.height) < _WATCHED
+        near = found.height < _AROUND
         close = np.zeros(len(obstacle.vertices), bool)
         close[topology.faces[found.face[near]]] = True
         # A garment triangle may span many of the ones beneath: look as far around as it reaches.
         for _ in range(1 + min(math.ceil(edge / obstacle.mean_edge), _MOST_RINGS)):
             close[topology.faces[_any_corner(close, topology.faces)]] = True
-        self.watched = near
+        self.found: Closest | None = found
+        """What the first query found, until vertices move."""
+        self.watched = found.height < _WATCHED
         self.watched_foreign: Bool[np.ndarray, " V"] | None = None
         self.vertices = np.flatnonzero(close & ~obstacle.tight)
         self.faces = np.flatnonzero(_any_corner(close, topology.faces))
@@ -141,7 +144,7 @@ class _Projector:
     ) -> None:
         self.start = self.position = position
         self.mesh, self.options = mesh, options
-        first = [o.contacts(position, mesh.parts, within=_WATCHED) for o in obstacles]
+        first = [o.contacts(position, mesh.parts, within=_AROUND) for o in obstacles]
         edge = mean_edge(position, mesh.topology.faces)
         self.near = [_Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
@@ -187,16 +190,20 @@ class _Projector:
             self.tight |= far
         for neighbour in self.near:
             neighbour.watched |= moved
+            neighbour.found = None
 
     def _lift_vertices(self, *, foreign: bool) -> Float[np.ndarray, "V 3"]:
         """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
         own, other = np.zeros_like(self.position), np.zeros_like(self.position)
         room = np.full(len(self.position), np.inf)
         for neighbour in self.near:
-            obstacle, index = neighbour.obstacle, np.flatnonzero(neighbour.watched)
-            points, parts = self.position[index], self.mesh.parts[index]
+            obstacle, index, found = neighbour.obstacle, np.flatnonzero(neighbour.watched), neighbour.found
+            if found is None:
+                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=_AROUND)
+            else:
+                index = np.arange(len(self.position))
+            points = self.position[index]
             margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
-            found = obstacle.contacts(points, parts, within=_WATCHED)
             keep_larger(own, _shortest_way(points, found, margin, self.options.reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
@@ -212,7 +219,7 @@ class _Projector:
         points = self.position[index]
         found = obstacle.contacts(points, ~self.mesh.parts[index], within=obstacle.margin)
         if watched is None:
-            neighbour.watched_foreign = np.abs(found.height) < _WATCHED
+            neighbour.watched_foreign = found.height < _WATCHED
         margin = np.full(len(index), obstacle.margin)
         keep_larger(lift, _shortest_way(points, found, margin, self.options.foreign_reach), index)
 
@@ -225,10 +232,8 @@ class _Projector:
         for neighbour in self.near:
             obstacle, index = neighbour.obstacle, neighbour.vertices
             found = query(obstacle.vertices[index])
-            gap = (
-                obstacle.margin / 2
-            )  # vertices already keep the whole margin; half of it allows for their chords
-            facing = np.einsum("pc,pc->p", obstacle.vertex_normals[index], found.normal)
+            gap = obstacle.margin / 2  # vertices keep the whole margin; half of it allows for their chords
+            facing = np.einsum("pc,pc->p", obstacle.normals.of_vertices[index], found.normal)
             poking = (found.height > -gap) & (found.height < self.options.poke_reach) & ~found.on_border
             hit = np.flatnonzero(poking & (facing > _SAME_SIDE))
             corner = faces[found.face[hit]]
@@ -258,7 +263,7 @@ class _Projector:
     def _part(self, obstacle: Obstacle, pairs: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "V 3"]:
         """Lift the garment's triangle of each pair over the plane of the other one."""
         faces, beneath = self.mesh.topology.faces[pairs[:, 0]], obstacle.mesh.topology.faces[pairs[:, 1]]
-        mine, theirs = unit_face_normals(self.position, faces), obstacle.face_normals[pairs[:, 1]]
+        mine, theirs = unit_face_normals(self.position, faces), obstacle.normals.of_faces[pairs[:, 1]]
         alike = np.einsum("pc,pc->p", mine, theirs)
         # Where the other triangle stands across the garment (a fold), its plane leads nowhere.
         plane = np.where((alike > _PARALLEL)[:, None], theirs, mine)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from isp_assets.errors import GeometryError
+from isp_assets.geometry.closest import SurfaceNormals
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.spread import keep_larger, spread
 
@@ -54,7 +55,7 @@ def tuck(
     pull = np.zeros(vertices.shape)
     if not covers:
         return vertices
-    normals = Obstacle(mesh, vertices, margin=0.0).vertex_normals
+    normals = SurfaceNormals(vertices, mesh.topology.faces).of_vertices
     for cover in covers:
         found = cover.contacts(np.ascontiguousarray(vertices, np.float64), mesh.parts, within=_REACH)
         stands_out = (found.height > give) & (found.height < _REACH) & ~found.on_border

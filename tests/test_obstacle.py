@@ -1,0 +1,81 @@
+"""Body parts of collision meshes, contact sought by part, and places without room."""
+
+import numpy as np
+import pytest
+from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, tube, weights
+
+from isp_assets.errors import GeometryError
+from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, mean_edge
+
+PARTS = list(BODY_PARTS)
+
+
+def test_every_joint_belongs_to_one_part() -> None:
+    joints = sorted(joint for group in BODY_PARTS.values() for joint in group)
+    assert joints == list(range(24))
+
+
+def test_parts_follow_the_weights_and_overlap_at_their_seams() -> None:
+    vertices, faces = tube(0.1)
+    share = np.clip((vertices[:, 1] + 0.1) / 0.2, 0, 1)  # torso below, arm above, blended between
+    mixed = (1 - share)[:, None] * weights(len(vertices), TORSO) + share[:, None] * weights(
+        len(vertices), LEFT_ARM
+    )
+    mesh = CollisionMesh.build(faces, mixed)
+    torso, arm = PARTS.index("torso"), PARTS.index("left_arm")
+    assert mesh.parts[share == 0][:, torso].all()
+    assert not mesh.parts[share == 0][:, arm].any()
+    assert mesh.parts[np.abs(share - 0.5) < 0.1][:, [torso, arm]].all()
+    assert set(mesh.part_faces[torso]) & set(mesh.part_faces[arm])
+    assert len(mesh.part_faces[torso]) + len(mesh.part_faces[arm]) > len(faces)
+
+
+def test_a_vertex_of_many_parts_belongs_to_its_strongest() -> None:
+    faces = np.array([[0, 1, 2]])
+    even = np.zeros((3, 24))
+    even[:, [0, 16, 17, 1, 2, 15]] = [0.15, 0.2, 0.15, 0.2, 0.15, 0.15]
+    assert CollisionMesh.build(faces, even).parts.sum(1).tolist() == [1, 1, 1]
+
+
+def test_contact_is_sought_on_shared_parts_only() -> None:
+    below, points = obstacle(ball()), np.array([[0.0, 0.105, 0.0], [0.0, 0.0, 0.09]])
+    own = below.contacts(points, collision((points, np.array([[0, 1, 0]]))).parts, within=0.01)
+    np.testing.assert_allclose(own.height, [0.005, -0.01], atol=3e-4)
+    foreign = below.contacts(points, np.zeros((2, 6), bool), within=0.01)
+    assert np.isinf(foreign.height).all()
+    assert np.array_equal(foreign.point, points)
+
+
+def test_points_far_from_a_part_are_not_sought_there() -> None:
+    below, points = obstacle(ball()), np.array([[0.0, 0.2, 0.0]])
+    parts = np.ones((1, 6), bool)
+    assert np.isinf(below.contacts(points, parts, within=0.05).height[0])
+    assert below.contacts(points, parts, within=0.15).height[0] == pytest.approx(0.1, abs=3e-4)
+
+
+def test_parts_together_find_what_the_whole_surface_finds() -> None:
+    vertices, faces = ball()
+    mesh = CollisionMesh.build(faces, np.where(vertices[:, :1] > 0, weights(1, TORSO), weights(1, LEFT_ARM)))
+    below = Obstacle(mesh, vertices, margin=0.003)
+    points = 0.1 * np.random.default_rng(0).normal(size=(200, 3))
+    split = below.contacts(points, np.ones((200, 6), bool), within=1.0)
+    np.testing.assert_allclose(split.height, below.whole(points).height, atol=1e-12)
+
+
+def test_room_is_missing_only_where_surfaces_press_together() -> None:
+    left, right = ball(centre=(-0.102, 0, 0)), ball(centre=(0.102, 0, 0))
+    vertices = np.concatenate([left[0], right[0]])
+    shape = (vertices, np.concatenate([left[1], right[1] + len(left[0])]))
+    assert not obstacle(ball()).tight.any()
+    tight = obstacle(shape, margin=0.003).tight
+    gap = np.linalg.norm(vertices * [0, 1, 1], axis=1) + 10 * (np.abs(vertices[:, 0]) > 0.05)
+    assert tight[gap < 0.005].all()
+    assert not tight[gap > 0.06].any()
+    given = np.zeros(len(vertices), bool)
+    assert Obstacle(collision(shape), vertices, margin=0.003, tight=given).tight is given
+
+
+def test_mean_edge_and_refusals() -> None:
+    assert mean_edge(np.array([[0, 0, 0], [0, 3, 0], [4, 0, 0]], float), np.array([[0, 1, 2]])) == 3.0
+    with pytest.raises(GeometryError, match="margin"):
+        obstacle(ball(), margin=-1.0)

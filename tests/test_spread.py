@@ -1,0 +1,48 @@
+"""Spreading moves over a mesh."""
+
+import numpy as np
+from collision_shapes import collision, sheet
+
+from isp_assets.geometry.spread import keep_larger, spread
+
+
+def _field(rings: int, decay: float = 0.9) -> np.ndarray:
+    shape = sheet(11)
+    move = np.zeros_like(shape[0])
+    move[60] = [0, 0.01, 0]  # the middle
+    return spread(move, collision(shape).neighbour_average, rings=rings, decay=decay)[:, 1].reshape(11, 11)
+
+
+def test_moved_vertices_keep_their_move_and_neighbours_follow_less_and_less() -> None:
+    field = _field(8)
+    assert field[5, 5] == 0.01
+    row = field[5, 5:]
+    assert (np.diff(row) <= 0).all()
+    assert 0 < row[1] < 0.01
+
+
+def test_as_many_rings_follow_as_asked_for() -> None:
+    reached = np.abs(np.subtract.outer(np.arange(11), [5])).reshape(11, 1)
+    for rings in (0, 1, 3):
+        moved = _field(rings) > 0
+        distance = np.maximum(reached, reached.T)
+        assert not moved[distance > rings].any()
+        assert moved[5, 5 + rings]
+
+
+def test_a_field_of_ones_is_kept_by_the_average() -> None:
+    average = collision(sheet(6)).neighbour_average
+    np.testing.assert_allclose(average @ np.ones(36), 1.0)
+
+
+def test_no_move_stays_no_move() -> None:
+    still = np.zeros((36, 3))
+    assert spread(still, collision(sheet(6)).neighbour_average, rings=4, decay=0.9) is still
+
+
+def test_the_longer_of_two_moves_is_kept_per_row() -> None:
+    kept = np.array([[1.0, 0, 0], [0, 0, 0], [0, 3.0, 0]])
+    keep_larger(kept, np.array([[0, 2.0, 0], [0, 0.5, 0]]), np.array([0, 2]))
+    assert kept.tolist() == [[0, 2.0, 0], [0, 0, 0], [0, 3.0, 0]]
+    keep_larger(kept, np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 9.0]]))
+    assert kept.tolist() == [[0, 2.0, 0], [0, 0, 1.0], [0, 0, 9.0]]
