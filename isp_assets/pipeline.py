@@ -69,9 +69,9 @@ def run_job(
     out.mkdir(parents=True, exist_ok=True)
     rows = _write_all(draped, writers, paths, measure_stages_every, clock, progress)
     clock["total"] = time.perf_counter() - started
-    report = _report(job, draped, options, rows, clock, paths)
-    write_text(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
-    return report
+    text = json.dumps(_report(job, draped, options, rows, clock, paths), indent=1, allow_nan=False)
+    write_text(out / "report.json", text + "\n")
+    return json.loads(text)
 
 
 def _check_paths(paths: dict[str, Path]) -> None:

@@ -89,8 +89,8 @@ def test_interrupt_leaves_nothing_half_written(job: Path, tmp_path: Path) -> Non
         time.sleep(0.05)
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
-    process.wait(timeout=120)
-    assert process.returncode == 130
+    _, message = process.communicate(timeout=120)
+    assert process.returncode == 130, message
     assert not [p for p in out.rglob("*") if p.is_file()]
 
 

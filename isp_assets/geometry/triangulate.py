@@ -21,7 +21,7 @@ a circumcircle there has radius 0.58 and cannot reach an outline point."""
 
 
 def triangulate_panel(
-    loops: Sequence[Float[np.ndarray, "n 2"]], spacing: float
+    loops: Sequence[Float[np.ndarray, "_ 2"]], spacing: float
 ) -> tuple[Float[np.ndarray, "P 2"], Int[np.ndarray, "F 3"]]:
     """Fill closed outlines with triangles of side about ``spacing``.
 
@@ -126,7 +126,9 @@ def _lattice_inside(loop: Float[np.ndarray, "n 2"], spacing: float):
     dense = (loop + step * (np.roll(loop, -1, axis=0) - loop)).reshape(-1, 2)
     distance = np.zeros(len(lattice))
     # A balanced tree recurses for ever on exact zeros where torch flushes denormal numbers.
-    distance[inside], _ = cKDTree(dense, balanced_tree=False).query(lattice[inside])
+    # Beyond the bound the distance comes back infinite, which is deep enough.
+    tree = cKDTree(dense, balanced_tree=False)
+    distance[inside], _ = tree.query(lattice[inside], distance_upper_bound=1.01 * _DEEP * spacing)
     kept = np.flatnonzero(distance > _CLEARANCE * spacing)
     deep = (distance > _DEEP * spacing).reshape(row.shape)
     triangles, used = _lattice_triangles(deep, np.abs(rows) % 2 == 1)
