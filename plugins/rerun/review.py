@@ -16,7 +16,9 @@ APPLICATION = "isp-assets"
 BODY_COLOR = (158, 153, 148)
 TIMELINE = "frame"
 _END_MARK = b"FOOT"  # rerun closes a whole file with this; without it the file was cut short
-_GROUPS = ("area_percent", "ms_per_frame")  # shown first and last
+_FINAL = "final"  # figures of the finished frame; those of earlier steps are recorded, but not plotted
+_ABOVE = ("body_area_percent", "inner_area_percent")  # plots that are always in sight; the others share tabs
+_LAST = "ms_per_frame"
 
 
 class Review:
@@ -120,7 +122,11 @@ class Review:
         entity = "/metrics/" + "/".join(path)
         if figure not in self._figures:
             self._figures.add(figure)
-            self._stream.log(entity, rr.SeriesLines(names=" / ".join(what) or kind), static=True)
+            self._stream.log(
+                entity,
+                rr.SeriesLines(names=" / ".join(part for part in what if part != _FINAL) or kind),
+                static=True,
+            )
         rows = np.array([k for k, figures in enumerate(block.figures) if figure in figures])
         values = np.array([block.figures[k][figure] for k in rows], np.float64)
         times = self._times(block.frames[rows], seconds[rows])
@@ -138,10 +144,10 @@ class Review:
         view = rrb.Spatial3DView(
             origin="/world", name=self._scene.name, eye_controls=eye, background=[236, 238, 241]
         )
-        plots = [self._plot(kind) for kind in self._kinds()]
-        column = [plots[0]] if plots else []
-        if len(plots) > 1:
-            column.append(rrb.Tabs(*plots[1:], active_tab=0))
+        kinds = sorted({f.rsplit("/", 1)[-1] for f in self._figures}, key=lambda kind: (kind == _LAST, kind))
+        above = [self._plot(kind) for kind in kinds if kind in _ABOVE]
+        tabs = [self._plot(kind) for kind in kinds if kind not in _ABOVE]
+        column = [*above, rrb.Tabs(*tabs, active_tab=0)] if tabs else above
         main = rrb.Horizontal(view, rrb.Vertical(*column), column_shares=[3, 1]) if column else view
         return rrb.Blueprint(
             main,
@@ -150,13 +156,10 @@ class Review:
             rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=self._scene.fps),
         )
 
-    def _kinds(self) -> list[str]:
-        first, last = _GROUPS
-        kinds = {figure.rsplit("/", 1)[-1] for figure in self._figures}
-        return sorted(kinds, key=lambda kind: (kind != first, kind == last, kind))
-
     def _plot(self, kind: str) -> Any:
         import rerun.blueprint as rrb
 
         origin = f"/metrics/{self._rr.escape_entity_path_part(kind)}"
-        return rrb.TimeSeriesView(origin=origin, name=kind.replace("_", " "))
+        stepwise = any(f.startswith(f"{_FINAL}/") and f.endswith(f"/{kind}") for f in self._figures)
+        contents = f"$origin/{_FINAL}/**" if stepwise else "$origin/**"
+        return rrb.TimeSeriesView(origin=origin, contents=contents, name=kind.replace("_", " "))

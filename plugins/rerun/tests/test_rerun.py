@@ -229,3 +229,22 @@ def test_file_cut_short_is_noticed(tmp_path, monkeypatch):
     with pytest.raises(PluginError, match="cut short"):
         writer.finish()
     assert not list(tmp_path.iterdir())
+
+
+def test_plots_show_the_finished_frame_only(tmp_path):
+    shot = synthetic_shot()
+    writer = RerunWriter()
+    writer.begin(tmp_path / "shot.rrd", shot.scene)
+    figures = {"final/L00_vest/body_area_percent": 0.0, "skin/L00_vest/body_area_percent": 4.0}
+    for part in shot.chunks(5):
+        writer.add(replace(part, metrics=(figures,) * 5))
+    writer.finish()
+    reader = chunk_api.RrdReader(tmp_path / "shot.rrd")
+    (blueprint,) = reader.blueprints()
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+    columns = [column for batch in batches for column in batch.columns if "timestamp" not in str(column.type)]
+    text = " ".join(str(column.to_pylist()) for column in columns)
+    assert "$origin/final/**" in text
+    assert "/metrics/body_area_percent" in text
+    recorded = {path for path, _ in Recording(tmp_path / "shot.rrd").moving}
+    assert "/metrics/body_area_percent/skin/L00_vest" in recorded
