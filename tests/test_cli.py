@@ -83,6 +83,8 @@ def test_interrupt_leaves_nothing_half_written(job: Path, tmp_path: Path) -> Non
     process = subprocess.Popen(
         command("drape", job, "--out", out, "--write", "usd,sheet"),
         env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        # A background shell starts its children with SIGINT ignored, and Python leaves it so.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     deadline = time.monotonic() + 120
     while not out.exists() and time.monotonic() < deadline:
