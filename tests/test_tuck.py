@@ -16,7 +16,7 @@ def test_a_wide_hem_is_drawn_in_under_the_cover_and_the_rest_follows_smoothly() 
     shirt, trousers = tube(0.15, low=-0.3, high=0.3), tube(0.1, low=-0.4, high=0.0)
     after = tuck(shirt[0], collision(shirt), [obstacle(trousers)])
     radius = _radius(after)
-    under = shirt[0][:, 1] < -0.02
+    under = shirt[0][:, 1] < -0.07  # below, the border of the cover lets it out softly
     assert radius[under].max() < 0.1 + GIVE + 5e-4
     assert radius[shirt[0][:, 1] > 0.28].min() > 0.145  # the far end hardly moves
     profile = radius.reshape(21, -1).mean(1)

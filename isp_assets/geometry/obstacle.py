@@ -54,6 +54,16 @@ class CollisionMesh:
         matrix.data /= np.repeat(np.maximum(np.diff(matrix.indptr), 1), np.diff(matrix.indptr))
         return matrix
 
+    @cached_property
+    def border_rings(self) -> Float[np.ndarray, " V"]:
+        """Edges between each vertex and the open border, counted up to 4."""
+        faces = self.topology.faces
+        rings = np.where(self.topology.border_vertex, 0.0, 4.0)
+        for _ in range(3):
+            nearest = rings[faces].min(1) + 1
+            np.minimum.at(rings, faces.reshape(-1), np.repeat(nearest, 3))
+        return rings
+
     @classmethod
     def build(
         cls, faces: Int[np.ndarray, "F 3"], joint_weights: Float[np.ndarray, "V 24"]

@@ -34,6 +34,7 @@ _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
 _AROUND = 0.015  # vertices this near [m] at the start make the surface around them a neighbour
 _WATCHED = 0.008  # vertices this near [m] at the start are looked at again in every round
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
+_POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _FINISH_STEP = 0.004  # largest lift [m] of one such correction
 _MOST_RINGS = 8
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
@@ -158,7 +159,8 @@ class _Projector:
             last = done == options.rounds - 1
             lift = self._lift_vertices(foreign=not last)
             if done > 0 or not lift.any():
-                keep_larger(lift, self._lift_triangles(self.position + lift))
+                poke = self._lift_triangles(self.position + lift)
+                lift = np.where((lift != 0).any(1, keepdims=True), lift, poke)
             if np.abs(lift).max(initial=0) < options.tolerance:
                 return done
             rings = 0 if last else options.spread
@@ -241,7 +243,8 @@ class _Projector:
             free = own & ~self.tight[corner].any(1)
             hit, corner, weights = hit[free], corner[free], found.weights[hit[free]]
             share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
-            push = ((found.height[hit] + gap)[:, None] * share)[..., None] * found.normal[hit][:, None]
+            size = (found.height[hit] + gap)[:, None] * share
+            push = size.clip(0, _POKE_STEP)[..., None] * found.normal[hit][:, None]
             keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
         return lift
 

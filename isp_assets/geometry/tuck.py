@@ -11,10 +11,10 @@ Positions are in metres, in one shared space. NumPy, one frame and one garment a
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import SurfaceNormals
+from isp_assets.geometry.closest import Closest, SurfaceNormals
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.spread import keep_larger, spread
 
@@ -22,11 +22,9 @@ GIVE = 0.006
 """How far an inner garment may stand out of an outer one before it gives way [m]."""
 
 _REACH = 0.12  # garments further apart than this [m] have nothing to do with one another
-_RINGS, _DECAY = (
-    24,
-    0.98,
-)  # rings of neighbours that follow, and how much of it: a soft fall over ten centimetres
-_SAME_SIDE = 0.25  # cosine from which two pieces of cloth count as facing the same way
+_RINGS, _DECAY = 24, 0.98  # rings of neighbours that follow, and how much of it: over some ten centimetres
+_BORDER_RINGS = 2.0  # edges from a cover's border at which its pull is firm
+_SURE = (0.3, 0.7)  # cosines between which a pull becomes firm
 
 
 def tuck(
@@ -52,16 +50,44 @@ def tuck(
     """
     if give < 0:
         raise GeometryError(f"give must be >= 0 m, got {give:g}")
-    pull = np.zeros(vertices.shape)
     if not covers:
         return vertices
+    pull, firm = np.zeros(vertices.shape), np.zeros(len(vertices))
     normals = SurfaceNormals(vertices, mesh.topology.faces).of_vertices
     for cover in covers:
         found = cover.contacts(np.ascontiguousarray(vertices, np.float64), mesh.parts, within=_REACH)
-        stands_out = (found.height > give) & (found.height < _REACH) & ~found.on_border
-        stands_out &= np.einsum("vc,vc->v", normals, found.normal) > _SAME_SIDE
-        share = (1 - give / np.maximum(found.height, 1e-9))[:, None]
-        keep_larger(pull, np.where(stands_out[:, None], share * (found.point - vertices), 0.0))
+        height = np.where(found.on_border | (found.height > _REACH), 0.0, found.height)
+        stands_out = (height > give)[:, None]
+        # Straight inwards, not to the closest point: that one leaps as a crease goes by, the height does not.
+        offered = np.where(stands_out, (give - height)[:, None] * normals, 0.0)
+        towards = np.where(stands_out, (found.point - vertices) / np.maximum(height, 1e-9)[:, None], 0.0)
+        firm = np.where(_longer(offered, pull), _firmness(towards, normals, cover, found), firm)
+        keep_larger(pull, offered)
     if not pull.any():
         return vertices
-    return vertices + spread(pull, mesh.neighbour_average, rings=_RINGS, decay=_DECAY)
+    # Where a pull is not firm it fades into what the neighbourhood does: a vertex that slips
+    # past a border or round a fold from one frame to the next must not jump.
+    held = np.where((firm >= 1)[:, None], pull, 0.0)
+    followed = spread(held, mesh.neighbour_average, rings=_RINGS, decay=_DECAY)
+    return vertices + firm[:, None] * pull + (1 - firm[:, None]) * followed
+
+
+def _firmness(
+    towards: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], cover: Obstacle, found: Closest
+) -> Float[np.ndarray, " V"]:
+    """0 to 1: how sure it is that a vertex belongs beneath the cover.
+
+    It is sure inside the cover's border, where both cloths face the same way and the cover
+    lies straight inwards. In the folds of an armpit none of this holds.
+    """
+    rings = cover.mesh.border_rings[cover.mesh.topology.faces[found.face]]
+    inside = np.einsum("vk,vk->v", rings, found.weights) / _BORDER_RINGS
+    alike = np.einsum("vc,vc->v", normals, found.normal)
+    inwards = -np.einsum("vc,vc->v", normals, towards)
+    low, high = _SURE
+    facing = ((np.minimum(alike, inwards) - low) / (high - low)).clip(0, 1)
+    return inside.clip(0, 1) * facing
+
+
+def _longer(first: Float[np.ndarray, "V 3"], second: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
+    return np.einsum("vc,vc->v", first, first) > np.einsum("vc,vc->v", second, second)
