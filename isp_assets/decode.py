@@ -29,7 +29,7 @@ RESOLUTIONS = (32, 512)
 """Coarsest and finest mesh: grid cells across a panel's square."""
 _OUTLINE_CELLS = 256
 """Outlines are found on a grid at least this fine, so coarse and fine meshes have one shape."""
-_SLIVER = 0.06
+_SLIVER = 0.1
 """Longest edge that one panel may have and the other lack [network units]."""
 
 

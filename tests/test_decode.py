@@ -262,10 +262,21 @@ def test_a_panel_that_leaves_its_square_is_reported(skirt):
         decode_garment(skirt, np.array([0.5, 0.0]))
 
 
-def test_a_missing_partner_is_reported():
-    bare = [(label if label != 4 else 3, points) for label, points in SKIRT]
-    with pytest.raises(DecodeError, match=r"seam \(4, 4\): the front panel .* no partner on the back"):
-        decode_garment(polygon_model([SKIRT], [bare], SKIRT_SEAMS), ZERO)
+def test_a_missing_partner_is_reported(shirt):
+    """A sleeved front and a back without sleeves."""
+    vest = [
+        (1, [(-0.35, -0.7), (0.35, -0.7)]),
+        (2, [(0.35, -0.7), (0.35, 0.1)]),
+        (4, [(0.35, 0.1), (0.3, 0.48)]),
+    ]
+    vest += [
+        (5, [(0.3, 0.48), (0.15, 0.5)]),
+        (10, [(0.15, 0.5), (-0.15, 0.5)]),
+        (6, [(-0.15, 0.5), (-0.3, 0.48)]),
+    ]
+    vest += [(7, [(-0.3, 0.48), (-0.35, 0.1)]), (9, [(-0.35, 0.1), (-0.35, -0.7)])]
+    with pytest.raises(DecodeError, match=r"seam \([38], [38]\): the front panel .* no partner on the back"):
+        decode_garment(polygon_model([SHIRT], [vest], SHIRT_SEAMS), ZERO)
 
 
 @pytest.mark.parametrize("resolution", [0, 31, 513])

@@ -128,6 +128,14 @@ def test_dissolving_gives_a_run_to_its_longer_neighbour():
     assert {run.label: len(run.points) for run in runs} == {1: 3, 3: 2}
 
 
+def test_dissolving_into_a_chosen_neighbour():
+    loop = tuple(
+        EdgeRun(k, np.array([[0.0, 0.0], [length, 0.0]])) for k, length in ((1, 5.0), (2, 0.1), (3, 2.0))
+    )
+    assert {run.label: len(run.points) for run in dissolve(loop, 1, label=3)} == {1: 2, 3: 3}
+    assert {run.label: len(run.points) for run in dissolve(loop, 1, label=8)} == {1: 3, 3: 2}
+
+
 def test_dissolving_between_equal_labels_joins_them():
     ends = [[0.0, 0.0], [1.0, 0.0], [1.1, 0.0], [2.0, 0.0], [1.0, 3.0]]
     labels = [1, 2, 1, 3, 4]

@@ -6,7 +6,7 @@ from analytic_panels import JACKET_FRONT, SHIRT, SHIRT_SEAMS, SKIRT, SKIRT_SEAMS
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.edge_runs import EdgeRun
-from isp_assets.geometry.sewing import SewnPanels, sew_panels, split_chords
+from isp_assets.geometry.sewing import SewnPanels, sew_panels
 from isp_assets.geometry.topology import boundary_loops, edges
 
 
@@ -116,14 +116,29 @@ def test_a_sliver_without_a_partner_joins_its_neighbour():
     assert len(sewn.seams) == 2
 
 
+@pytest.mark.parametrize("front_is_split", [True, False])
+def test_panels_that_differ_only_in_a_label_agree(front_is_split):
+    """The other outline runs alongside and calls the whole side 2: so does the panel that split it."""
+    panels = [_runs(_with_sliver(0.4)), _runs(SKIRT)]
+    sewn = _sew(*(panels if front_is_split else panels[::-1]), (*SKIRT_SEAMS, (9, 9)))
+    _check_surface(sewn, 2)
+    assert len(sewn.seams) == 2
+
+
+def test_agreement_crosses_to_the_other_panels_names():
+    """A stretch that the back calls 7 is one that the front calls 2, if 2 and 7 are sewn."""
+    renamed = [({2: 7, 4: 8}.get(label, label), points) for label, points in SKIRT]
+    _check_surface(_sew(_runs(_with_sliver(0.4)), _runs(renamed), ((2, 7), (4, 8), (9, 9))), 2)
+
+
 def test_an_edge_without_a_partner_is_an_error():
-    with pytest.raises(
-        GeometryError,
-        match=r"seam \(9, 9\): the front panel has an edge of length 0\.\d+ that finds no partner",
-    ):
-        _sew(_runs(_with_sliver(0.2)), _runs(SKIRT), (*SKIRT_SEAMS, (9, 9)))
-    with pytest.raises(GeometryError, match=r"seam \(9, 9\): the back panel"):
-        _sew(_runs(SKIRT), _runs(_with_sliver(0.2)), (*SKIRT_SEAMS, (9, 9)))
+    """A sleeve on one side only: no outline runs along it."""
+    sleeve = [(0.6, -0.7), (0.7, -0.2)], [(0.7, -0.2), (0.9, 0.5)], [(0.9, 0.5), (0.3, 0.6)]
+    sleeved = [SKIRT[0], (2, sleeve[0]), (9, sleeve[1]), (5, sleeve[2]), *SKIRT[2:]]
+    message = r"seam \(9, 9\): the {} panel has an edge of length 0\.728 that finds no partner"
+    for side, panels in (("front", (sleeved, SKIRT)), ("back", (SKIRT, sleeved))):
+        with pytest.raises(GeometryError, match=message.format(side)):
+            _sew(*map(_runs, panels), (*SKIRT_SEAMS, (9, 9)))
 
 
 def test_a_whole_outline_cannot_be_sewn():
@@ -172,22 +187,6 @@ def test_a_sleeve_narrower_than_two_triangles_keeps_its_sides_apart():
         (4, [(-0.8, 0.03), (-0.8, -0.03)]),
     ]
     _check_surface(_sew(_runs(strip), _runs(strip), ((1, 1), (3, 3)), spacing=0.06), 2)
-
-
-def test_splitting_chords_keeps_area_and_winding():
-    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [2.0, 0.5]])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 2]])
-    for sewn in np.array(np.meshgrid(*[[False, True]] * 5)).reshape(5, -1).T:
-        new_points, new_faces = split_chords(points, faces, sewn)
-        a, b, c = (new_points[new_faces[:, k]] for k in range(3))
-        area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-        assert (area > 0).all()
-        assert area.sum() == pytest.approx(1.5)
-        mesh = edges(new_faces)
-        inner = mesh.vertices[mesh.num_faces == 2]
-        full = np.concatenate([sewn, np.zeros(len(new_points) - 5, bool)])
-        assert not full[inner].all(axis=1).any()
-        assert len(new_points) == 5 + int(sewn[0] and sewn[2]) + int(sewn[1] and sewn[2])
 
 
 def test_border_labels_and_corners():

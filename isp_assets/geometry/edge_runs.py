@@ -86,16 +86,20 @@ def split_edges(points: Float[np.ndarray, "n 2"], logits: Float[np.ndarray, "n L
     )
 
 
-def dissolve(loop: tuple[EdgeRun, ...], index: int) -> tuple[EdgeRun, ...]:
-    """Give one run of a loop to its longer neighbour; runs that then meet with one label become one.
+def dissolve(loop: tuple[EdgeRun, ...], index: int, *, label: int | None = None) -> tuple[EdgeRun, ...]:
+    """Give one run of a loop to a neighbour; runs that then meet with this label become one.
 
-    A loop of a single run is returned unchanged.
+    Args:
+        loop: Runs in order; a lone run stays as it is.
+        index: The run to dissolve.
+        label: Label that it gets if a neighbour has it; otherwise the longer neighbour's.
     """
     if len(loop) == 1:
         return loop
     rotated = loop[index:] + loop[:index]
-    before, after = rotated[-1], rotated[1]
-    label = max((before, after), key=lambda run: run.length).label
+    neighbours = (rotated[-1], rotated[1])
+    if label not in {run.label for run in neighbours}:
+        label = max(neighbours, key=lambda run: run.length).label
     return join_alike((EdgeRun(label, rotated[0].points), *rotated[1:]), {label})
 
 

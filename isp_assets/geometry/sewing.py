@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import GeometryError
+from isp_assets.geometry.chords import split_chords
 from isp_assets.geometry.edge_runs import EdgeRun, dissolve, join_alike
 from isp_assets.geometry.outline import resample_open
 from isp_assets.geometry.seam_fade import SeamFade, seam_fade
@@ -93,8 +94,9 @@ def sew_panels(
 ) -> SewnPanels:
     """Match, resample, triangulate and weld.
 
-    An edge that neither panel has makes no seam. An edge that only one panel has
-    is dissolved if it is a sliver.
+    An edge that neither panel has makes no seam. An edge that only one panel has is
+    dissolved into a neighbour if it is a sliver, or if the other panel's outline runs
+    alongside and calls that stretch by the neighbour's label.
 
     Args:
         outlines: Per panel ("front", "back"), its loops of labelled runs.
@@ -129,7 +131,7 @@ def sew_panels(
 def _match(
     loops: dict[str, list[Loop]], seam_pairs: Sequence[tuple[int, int]], sliver: float
 ) -> list[_Match]:
-    """Pair the runs of every seam; dissolves slivers in ``loops``, in place."""
+    """Pair the runs of every seam; dissolves those without a partner in ``loops``, in place."""
     while True:
         matches, spare = [], []
         for labels in seam_pairs:
@@ -140,13 +142,36 @@ def _match(
         if not spare:
             return matches
         length, side, (loop, run), labels = min(spare, key=lambda entry: entry[0])
-        if length > sliver or len(loops[side][loop]) == 1:
-            other = PANELS[side == "front"]
+        other = PANELS[side == "front"]
+        lone, runs = loops[side][loop][run], loops[side][loop]
+        label = _label_across(lone, loops[other], _renaming(seam_pairs, other), reach=0.5 * sliver)
+        disputed = label in {runs[run - 1].label, runs[(run + 1) % len(runs)].label}
+        if len(runs) == 1 or not (disputed or length <= sliver):
             raise GeometryError(
                 f"seam {labels}: the {side} panel has an edge of length {length:.3g} "
                 f"that finds no partner on the {other} panel"
             )
-        loops[side][loop] = dissolve(loops[side][loop], run)
+        loops[side][loop] = dissolve(runs, run, label=label)
+
+
+def _renaming(seam_pairs: Sequence[tuple[int, int]], side: str) -> dict[int, int]:
+    """From the labels of one panel to those they are sewn to on the other."""
+    return {pair[0]: pair[1] for pair in (p if side == "front" else p[::-1] for p in seam_pairs)}
+
+
+def _label_across(
+    lone: EdgeRun, others: Sequence[Loop], renaming: Mapping[int, int], *, reach: float
+) -> int | None:
+    """What the other panel calls the stretch of its outline that lies along a run; None if none does."""
+    runs = [run for loop in others for run in loop]
+    along = [resample_open(run.points, 2 + round(2 * run.length / reach)) for run in runs]
+    places = np.concatenate(along)
+    labels = np.repeat([renaming.get(run.label, run.label) for run in runs], [len(p) for p in along])
+    samples = resample_open(lone.points, 22)[1:-1]
+    distance = np.linalg.norm(samples[:, None] - places, axis=-1)
+    if distance.min(axis=1).mean() > reach:
+        return None
+    return int(np.bincount(labels[distance.argmin(axis=1)]).argmax())
 
 
 def _find(loops: Sequence[Loop], label: int) -> list[tuple[int, int]]:
@@ -223,45 +248,6 @@ def _seam(match: _Match, loops: Mapping[str, list[Loop]], panels: Mapping[str, F
         number = sum(len(runs) for runs in loops[side][:loop]) + run
         ends.append(panels[side].runs[number][1])
     return FlatSeam(match.labels, *ends)
-
-
-def split_chords(
-    points: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"], sewn: Bool[np.ndarray, " P"]
-) -> tuple[Float[np.ndarray, "Q 2"], Int[np.ndarray, "G 3"]]:
-    """Halve every inner edge between two sewn points.
-
-    Such a chord, as across a narrow sleeve or a sharp corner, tends to be in both
-    panels; sewn, its two copies would be one edge with four faces.
-    """
-    mesh = edges(faces)
-    chord = (mesh.num_faces == 2) & sewn[mesh.vertices].all(axis=1)
-    if not chord.any():
-        return points, faces
-    middle = np.full(len(mesh.vertices), -1)
-    middle[chord] = len(points) + np.arange(chord.sum())
-    points = np.concatenate([points, points[mesh.vertices[chord]].mean(axis=1)])
-    cut = chord[mesh.face_edge]
-    kept, parts = faces[~cut.any(axis=1)], []
-    for face, mid in zip(faces[cut.any(axis=1)], middle[mesh.face_edge[cut.any(axis=1)]], strict=True):
-        parts.append(_split_face(points, face, mid))
-    return points, np.concatenate([kept, *parts])
-
-
-def _split_face(points: Float[np.ndarray, "P 2"], face: Int[np.ndarray, "3"], mid: Int[np.ndarray, "3"]):
-    """Triangles of a face with a new point on each edge where ``mid`` is not negative."""
-    count = int((mid >= 0).sum())
-    if count == 3:
-        (a, b, c), (p, q, r) = face, mid
-        return np.array([(a, p, r), (p, b, q), (r, q, c), (p, q, r)])
-    # Turn the face until the first edge is cut (one cut) or the last is whole (two cuts).
-    turn = int(np.flatnonzero(mid >= 0)[0]) if count == 1 else int(np.flatnonzero(mid < 0)[0] + 1) % 3
-    (a, b, c), (p, q, _) = np.roll(face, -turn), np.roll(mid, -turn)
-    if count == 1:
-        return np.array([(a, p, c), (p, b, c)])
-    tip = (p, b, q)
-    if np.linalg.norm(points[a] - points[q]) <= np.linalg.norm(points[p] - points[c]):
-        return np.array([tip, (a, p, q), (a, q, c)])
-    return np.array([tip, (a, p, c), (p, q, c)])
 
 
 def _check_surface(faces: Int[np.ndarray, "F 3"]) -> None:
