@@ -54,7 +54,7 @@ class FoundPlugin:
     origin: str
     version: str
     error: str | None = None
-    writer: type | None = None
+    writer: type[Any] | None = None
 
 
 def find_writers() -> dict[str, FoundPlugin]:
