@@ -161,7 +161,7 @@ class _Draper:
         return vertices
 
     def _tuck(self, layers: list[Float[Tensor, "T _ 3"]], state: "_ChunkState") -> None:
-        """Let wide inner layers give way to the layers over them; replaces entries of ``layers``."""
+        """Let wide inner layers give way to held layers over them; replaces entries of ``layers``."""
         if "tuck" in self.options.steps and len(layers) > 1:
             with state.timed("tuck"):
                 layers[:] = [vertices.clone() for vertices in layers]
@@ -178,7 +178,8 @@ class _Draper:
             if after is not before:
                 layers[index][t] = torch.as_tensor(after).to(layers[index])
                 state.steps[index][t].append("tuck")
-            covers.append(Obstacle(worn.collision, after, margin=0.0))
+            if len(worn.layer.garment.anchors):  # what the body holds cannot give way; all else is lifted
+                covers.append(Obstacle(worn.collision, after, margin=0.0))
 
     def _settle(
         self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
