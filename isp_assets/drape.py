@@ -1,7 +1,7 @@
 """Drape an outfit over a shot: the ladder of solvers, chunk by chunk.
 
 Rungs, in order: ``skin`` (Eqs. 6-7), ``displace`` (D_s), ``tuck`` (a wide inner layer gives
-way to the ones worn over it), ``layering`` (D_m, Eqs. 9-12), ``project`` (leaves no contact).
+way to a held one worn over it), ``layering`` (D_m, Eqs. 9-12), ``project`` (leaves no contact).
 Each layer is corrected once against everything beneath it, so the cost of layering grows
 linearly with the number of layers. A rung that a frame does not need is skipped there, and
 the chunk says what ran.
