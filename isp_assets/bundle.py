@@ -7,10 +7,12 @@ by default; buffers and codes keep their precision. Saving what was loaded gives
 """
 
 import difflib
+import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -67,6 +69,27 @@ class GarmentBundle:
     @property
     def category(self) -> str:
         return self.model.category
+
+    @cached_property
+    def model_sha256(self) -> str:
+        """Digest of the pattern networks, at the precision they are stored with: what a code belongs to."""
+        digest = hashlib.sha256()
+        for networks in (self.model.panel_fields, self.model.atlases):
+            for side in PANELS:
+                for name, value in networks[side].state_dict().items():
+                    digest.update(f"{side} {name} {tuple(value.shape)}".encode())
+                    digest.update(value.half().cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    def with_code(self, name: str, code: Float[np.ndarray, " Z"]) -> "GarmentBundle":
+        """The bundle with one garment more.
+
+        Raises:
+            BundleError: If the name is taken.
+        """
+        if name in self.codes:
+            raise BundleError(f"bundle {self.category!r} has a garment {name!r} already; choose another name")
+        return replace(self, codes={**self.codes, name: code})
 
     def code(self, name: str) -> Float[np.ndarray, " Z"]:
         """The latent code of a garment.

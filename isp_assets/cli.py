@@ -15,6 +15,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from isp_assets.cli_evaluate import evaluate_app
+from isp_assets.cli_fit import fit_app
 from isp_assets.cli_train import dataset_app, train_app
 from isp_assets.conventions import FrameRange
 from isp_assets.errors import IspAssetsError
@@ -30,6 +32,8 @@ app = typer.Typer(
 )
 app.add_typer(dataset_app, name="dataset")
 app.add_typer(train_app, name="train")
+app.add_typer(fit_app, name="fit")
+app.add_typer(evaluate_app, name="evaluate")
 out_console = Console()
 error_console = Console(stderr=True, soft_wrap=True)
 

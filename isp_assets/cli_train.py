@@ -32,9 +32,10 @@ HoldOutOption = Annotated[
 @dataset_app.command("make")
 def make(
     out: OutOption,
-    tops: Annotated[int, typer.Option(help="Shirts and jackets; the first nine are named.")] = 60,
-    skirts: Annotated[int, typer.Option(help="Skirts; the first five are named.")] = 60,
-    trousers: Annotated[int, typer.Option(help="Trousers; the first five are named.")] = 60,
+    tops: Annotated[int, typer.Option(help="Shirts and jackets; the first ten are named.")] = 400,
+    skirts: Annotated[int, typer.Option(help="Skirts; the first five are named.")] = 300,
+    trousers: Annotated[int, typer.Option(help="Trousers; the first five are named.")] = 200,
+    test: Annotated[int, typer.Option(help="Further garments of each, kept for testing.")] = 20,
     seed: SeedOption = 0,
     body: Annotated[str, typer.Option(help='"default" or an SMPL .npz or .pkl file.')] = "default",
     workers: Annotated[int, typer.Option(help="Processes, one thread each.")] = 2,
@@ -52,6 +53,7 @@ def make(
         make_dataset(
             out,
             counts={category: count for category, count in counts.items() if count},
+            test=test,
             seed=seed,
             body=body,
             workers=workers,
@@ -60,6 +62,21 @@ def make(
                 task, completed=done, total=total, description=text
             ),
         )
+
+
+@dataset_app.command("sheet")
+def sheet(
+    data: DataOption,
+    category: CategoryOption,
+    out: Annotated[Path, typer.Option("--out", help="PNG to write.")],
+    count: Annotated[int, typer.Option(help="Garments to draw.")] = 12,
+    seed: SeedOption = 0,
+) -> None:
+    """Draw a random sample of a data set: flat panels, and the rest shapes from both sides."""
+    from isp_assets.train.dataset import load_dataset
+    from isp_assets.train.dataset_sheet import draw_sheet
+
+    draw_sheet(load_dataset(data, category), out, count=count, seed=seed)
 
 
 @train_app.command("patterns")

@@ -17,6 +17,8 @@
 """
 
 import difflib
+import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,8 +26,10 @@ from pathlib import Path
 from typing import Any
 
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
-from isp_assets.errors import CollectionError, InputError
+from isp_assets.code_file import GarmentCode
+from isp_assets.errors import BundleError, CollectionError, InputError
 from isp_assets.fabric_style import FabricStyle
+from isp_assets.files import write_text
 from isp_assets.outfit import Outfit, OutfitItem
 from isp_assets.toml_file import check_keys, read_toml
 
@@ -148,6 +152,81 @@ class Collection:
             OutfitError: If the list is empty or the parts do not belong together.
         """
         return Outfit(tuple(self.item(n) for n in names), self.skin, self.layering)
+
+    def bundle_files(self) -> tuple[str, ...]:
+        """Names of the bundle files, each once."""
+        return tuple(dict.fromkeys(entry.bundle for entry in self.entries.values()))
+
+    def add(self, garment: GarmentCode, *, color: str = "#8f8f8f", fabric: str = "plain") -> "Collection":
+        """Add a garment to the folder: its code to the bundle of its category, its entry to the list.
+
+        Args:
+            garment: Found with the networks of that bundle.
+            color: Of the cloth, as in ``collection.toml``.
+            fabric: Kind of the cloth, as in ``collection.toml``.
+
+        Returns:
+            The collection as it is now. Both files are replaced whole; should the second fail,
+            the bundle holds a code that no entry names, which harms nothing.
+
+        Raises:
+            CollectionError: If the collection is the built-in one, has no bundle of the category,
+                or has a garment of that name.
+            BundleError: If the code belongs to other networks, or its name is taken.
+        """
+        path = self.folder / FILE_NAME
+        if self.folder.resolve() == DEFAULT_FOLDER.resolve():
+            raise CollectionError(
+                "the built-in collection is not changed; copy it to a folder, and add there"
+            )
+        if garment.name in self.entries:
+            raise CollectionError(f"{path}: has a garment {garment.name!r} already; choose another name")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", garment.name):
+            raise CollectionError(
+                f"{path}: a garment's name is made of letters, digits, _ and -, got {garment.name!r}"
+            )
+        found = [file for file in self.bundle_files() if self.bundle(file).category == garment.category]
+        if not found:
+            raise CollectionError(f"{path}: no bundle of category {garment.category!r} to add the garment to")
+        bundle = self.bundle(found[0])
+        if bundle.model_sha256 != garment.model_sha256:
+            raise BundleError(
+                f"{self.folder / found[0]}: the code of {garment.name!r} was found with other networks; "
+                "fit it with this collection"
+            )
+        FabricStyle.from_text(color=color, kind=fabric)
+        lines = [f"[garments.{garment.name}]", f'bundle = "{found[0]}"', f'color = "{color}"']
+        text = (
+            path.read_text(encoding="utf-8").rstrip()
+            + "\n\n"
+            + "\n".join([*lines, f'fabric = "{fabric}"', ""])
+        )
+        bundle.with_code(garment.name, garment.code).save(self.folder / found[0])
+        write_text(path, text)
+        return Collection.load(self.folder)
+
+    def copy_to(self, folder: str | Path) -> "Collection":
+        """Copy the collection's files into a new folder.
+
+        Raises:
+            CollectionError: If the folder exists.
+        """
+        folder = Path(folder)
+        if folder.exists():
+            raise CollectionError(f"{folder} exists; a collection is copied into a new folder")
+        partial = folder.with_name(f".{folder.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        try:
+            files = {FILE_NAME, self.skin_file, *self.bundle_files()}
+            for file in files | ({self.layering_file} if self.layering_file else set()):
+                (partial / file).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(self.folder / file, partial / file)
+            partial.rename(folder)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+        return Collection.load(folder)
 
     @cached_property
     def _bundles(self) -> dict[str, GarmentBundle]:

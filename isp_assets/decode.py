@@ -29,7 +29,7 @@ RESOLUTIONS = (32, 512)
 """Coarsest and finest mesh: grid cells across a panel's square."""
 _OUTLINE_CELLS = 256
 """Outlines are found on a grid at least this fine, so coarse and fine meshes have one shape."""
-_SLIVER = 0.1
+SLIVER = 0.1
 """Longest edge that one panel may have and the other lack [network units]."""
 
 
@@ -91,7 +91,7 @@ def decode_with_report(
         times = [time.perf_counter()]
         cut = cut_panels(model, code, resolution=resolution)
         times.append(time.perf_counter())
-        sewn = sew_panels(cut.outlines, model.seam_pairs, spacing=2.0 / resolution, sliver=_SLIVER)
+        sewn = sew_panels(cut.outlines, model.seam_pairs, spacing=2.0 / resolution, sliver=SLIVER)
         times.append(time.perf_counter())
         with torch.no_grad():
             lifted = lift_points(model, sewn, torch.from_numpy(code))
@@ -151,22 +151,23 @@ def plane_field(network: PanelField, code: Float[np.ndarray, " Z"]) -> PlaneFiel
 
 
 def lift_points(
-    model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *, follow_border: bool = False
+    model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *, cut_code: Tensor | None = None
 ) -> dict[str, Float[Tensor, "P 3"]]:
     """Map every panel point to the rest body [m] (Eq. 3); differentiable in the code.
 
     Args:
-        model: The category's networks.
+        model: The category's networks, at the precision of ``code``.
         sewn: Flat panels [network units].
         code: Latent code.
-        follow_border: Whether border points move with the zero level when the code
-            changes. Values stay the same; gradients are those of Eq. 5.
+        cut_code: The code that the panels were cut at. Given it, border points move with
+            the zero level as the code leaves it, and gradients are those of Eq. 5;
+            without it the panels keep their outlines.
     """
     lifted = {}
     for side, panel in sewn.panels.items():
-        xy = _tensor(panel.points)
-        if follow_border:
-            xy = _follow_border(model.panel_fields[side], panel, xy, code)
+        xy = torch.from_numpy(panel.points).to(code)
+        if cut_code is not None:
+            xy = _follow_border(model.panel_fields[side], panel, xy, code, cut_code)
         lifted[side] = model.atlases[side](xy, code)
     return lifted
 
@@ -187,17 +188,18 @@ def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) ->
 
 
 def _follow_border(
-    network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"]
-):
+    network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"],
+    cut_code: Float[Tensor, " Z"],
+) -> Float[Tensor, "P 2"]:  # fmt: skip
     """Add ``-grad s (s(x, z) - s(x, z0)) / |grad s|^2`` on the border: 0 at ``z0``, sloped as in Eq. 5."""
     border = torch.from_numpy(np.flatnonzero(panel.border_label))
     points = xy[border].detach().requires_grad_()
     with torch.enable_grad():
-        value = network.signed_distance(points, code.detach())
+        value = network.signed_distance(points, cut_code.detach())
         (slope,) = torch.autograd.grad(value.sum(), points)
-    distance = network.signed_distance(xy[border], code)
     step = slope / (slope**2).sum(dim=-1, keepdim=True).clamp_min(0.1)
-    return xy.index_add(0, border, -step * (distance - distance.detach())[:, None])
+    moved = network.signed_distance(xy[border], code) - value.detach()
+    return xy.index_add(0, border, -step * moved[:, None])
 
 
 def _check(model: GarmentModel, code: Float[np.ndarray, " Z"], resolution: int) -> Float[np.ndarray, " Z"]:

@@ -10,6 +10,7 @@
     │   ├── CollectionError           collection folder, garment names
     │   ├── OutfitError               order or mix of layers
     │   ├── ShotError                 shot file
+    │   ├── MeshError                 mesh file of another program
     │   └── DatasetError              training data
     ├── GeometryError             exit code 4   a mesh or curve breaks an invariant
     │   ├── GarmentError              pattern, seams, rest mesh
@@ -58,6 +59,10 @@ class OutfitError(InputError):
 
 class ShotError(InputError):
     """A shot file is wrong."""
+
+
+class MeshError(InputError):
+    """A mesh file of another program is wrong, or does not look like a garment."""
 
 
 class DatasetError(InputError):

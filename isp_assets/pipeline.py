@@ -5,7 +5,6 @@ of the shot. If anything fails, every writer drops what it has begun.
 """
 
 import json
-import platform
 import resource
 import sys
 import time
@@ -14,13 +13,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
-import isp_assets
 from isp_assets.drape import DrapeOptions, drape
 from isp_assets.errors import IspAssetsError, PluginError
-from isp_assets.evaluate import FrameMeter, summarise
+from isp_assets.evaluate.frames import FrameMeter, summarise
+from isp_assets.evaluate.table import machine
 from isp_assets.files import write_text
 from isp_assets.frames import DrapedFrames, FrameChunk
 from isp_assets.plugin import ShotWriter, make_writer
@@ -163,7 +159,7 @@ def _report(
         },
         "layers": [_layer_row(layer) for layer in scene.layers],
         "options": asdict(options),
-        "machine": _machine(options.device),
+        "machine": machine(options.device),
         "seconds": {stage: round(s, 4) for stage, s in clock.items()},
         "milliseconds_per_frame": {
             stage: round(1000 * s / count, 2)
@@ -185,18 +181,6 @@ def _layer_row(layer: Any) -> dict[str, Any]:
         "vertices": garment.num_vertices,
         "faces": len(garment.faces),
         "seams": len(garment.seams),
-    }
-
-
-def _machine(device: str) -> dict[str, Any]:
-    return {
-        "device": device if device == "cpu" else torch.cuda.get_device_name(device),
-        "threads": torch.get_num_threads(),
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "isp_assets": isp_assets.__version__,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
     }
 
 

@@ -4,8 +4,9 @@ A data set is a folder::
 
     dataset.json                    categories, labels, statistics, counted rejections
     top/0000_tank_top.npz           one garment; arrays and a JSON text, nothing pickled
+    top/top_test_0000.npz           one that no network learns from
 
-Garments depend on (seed, category, index) alone, so a run that was cut off goes on
+Garments depend on (seed, category, training or test, index) alone, so a run that was cut off goes on
 where it stopped, with any number of workers. The first garments of a category are its
 named presets, the rest are random.
 """
@@ -26,6 +27,7 @@ from isp_assets.train.garment_maker import (
     CATEGORIES,
     FILE_VERSION,
     UNREADABLE,
+    Draft,
     GarmentMaker,
     Recipe,
     read_garment_file,
@@ -35,7 +37,7 @@ from isp_assets.train.worker_pool import run_tasks
 Progress = Callable[[int, int, str], None]
 
 _SCHEMA = "isp-assets/dataset"
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +95,7 @@ def make_dataset(
     out: Path,
     *,
     counts: Mapping[str, int],
+    test: int = 0,
     seed: int = 0,
     body: str = "default",
     workers: int = 2,
@@ -103,7 +106,8 @@ def make_dataset(
 
     Args:
         out: Folder; garments of the same seed, body and edge length already there are kept.
-        counts: Garments per category ("top", "skirt", "trousers").
+        counts: Training garments per category ("top", "skirt", "trousers").
+        test: Further garments of every category, all random, kept apart for testing.
         seed: Of the random garments.
         body: ``"default"`` or an SMPL file.
         workers: Processes, each with one thread; 1 works in this process.
@@ -116,15 +120,16 @@ def make_dataset(
     """
     out = Path(out)
     unknown = set(counts) - set(CATEGORIES)
-    if unknown or not counts or min(counts.values()) < 1 or workers < 1:
+    if unknown or not counts or min(counts.values()) < 1 or workers < 1 or test < 0:
         raise DatasetError(
-            f"expected counts >= 1 for categories among {sorted(CATEGORIES)} and workers >= 1, "
-            f"got {dict(counts)}, workers={workers}"
+            f"expected counts >= 1 for categories among {sorted(CATEGORIES)}, test >= 0 and workers >= 1, "
+            f"got {dict(counts)}, test={test}, workers={workers}"
         )
     recipe = Recipe(out=str(out), seed=seed, body=str(body), edge_length=edge_length)
     maker = GarmentMaker(recipe)
-    tasks = [(category, index) for category in CATEGORIES for index in range(counts.get(category, 0))]
-    missing = [task for task in tasks if not maker.is_made(*task)]
+    drafts = {category: _drafts(category, count, test) for category, count in counts.items()}
+    tasks = [draft for category in CATEGORIES for draft in drafts.get(category, ())]
+    missing = [task for task in tasks if not maker.is_made(task)]
     done = len(tasks) - len(missing)
 
     def report(message: str) -> None:
@@ -135,14 +140,14 @@ def make_dataset(
 
     if workers == 1:
         for task in missing:
-            report(maker.make(*task))
+            report(maker.make(task))
     else:
         run_tasks(missing, partial(_start_maker, recipe), _make, workers=workers, report=report)
-    _write_index(out, recipe, maker, counts)
+    _write_index(out, recipe, maker, drafts)
 
 
-def load_dataset(folder: Path, category: str) -> GarmentDataset:
-    """Read all garments of a category.
+def load_dataset(folder: Path, category: str, *, test: bool = False) -> GarmentDataset:
+    """Read the training garments of a category, or its test garments.
 
     Raises:
         DatasetError: If the folder holds no complete data set of this version, or lacks the category.
@@ -151,9 +156,12 @@ def load_dataset(folder: Path, category: str) -> GarmentDataset:
     if category not in index["categories"]:
         raise DatasetError(f"{folder} has no category {category!r}; it has {sorted(index['categories'])}")
     shared = index["categories"][category]
+    files = shared["test_files" if test else "files"]
+    if not files:
+        raise DatasetError(f"{folder} has no test garments of {category!r}; make it with --test")
     return GarmentDataset(
         category=category,
-        garments=tuple(_load_garment(Path(folder) / category / name) for name in shared["files"]),
+        garments=tuple(_load_garment(Path(folder) / category / name) for name in files),
         edge_names={int(label): name for label, name in shared["edge_names"].items()},
         seam_pairs=tuple((front, back) for front, back in shared["seam_pairs"]),
         anchor_labels=tuple(shared["anchor_labels"]),
@@ -220,20 +228,24 @@ def _start_maker(recipe: Recipe) -> None:
     _maker = GarmentMaker(recipe)
 
 
-def _make(task: tuple[str, int]) -> str:
+def _make(task: Draft) -> str:
     assert _maker is not None
-    return _maker.make(*task)
+    return _maker.make(task)
 
 
-def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, counts: Mapping[str, int]) -> None:
+def _drafts(category: str, count: int, test: int) -> list[Draft]:
+    return [Draft(category, i) for i in range(count)] + [Draft(category, i, test=True) for i in range(test)]
+
+
+def _write_index(out: Path, recipe: Recipe, maker: GarmentMaker, drafts: Mapping[str, list[Draft]]) -> None:
     categories = {}
     for name, category in CATEGORIES.items():
-        if name not in counts:
+        if name not in drafts:
             continue
-        paths = [maker.path(name, index) for index in range(counts[name])]
-        metas = [read_garment_file(path)[1] for path in paths]
+        metas = [read_garment_file(maker.path(draft))[1] for draft in drafts[name]]
         categories[name] = {
-            "files": [path.name for path in paths],
+            "files": [draft.file for draft in drafts[name] if not draft.test],
+            "test_files": [draft.file for draft in drafts[name] if draft.test],
             "edge_names": {str(label): text for label, text in category.edge_names.items()},
             "seam_pairs": category.seam_pairs,
             "anchor_labels": category.anchor_labels,

@@ -6,6 +6,7 @@ import zipfile
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,14 +23,44 @@ from isp_assets.train.pattern_trousers import TROUSERS
 from isp_assets.train.rest_drape import DrapeSettings, RestShape, drape_to_rest
 
 CATEGORIES: dict[str, PatternCategory] = {c.name: c for c in (TOP, SKIRT, TROUSERS)}
-FILE_VERSION = 1
+FILE_VERSION = 2
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 """What a missing or damaged garment file raises."""
 
 _ATTEMPTS = 8
 _OUTLINE_SPACING = 0.004
-_LIMITS = {"body_intersects": 0.5, "self_intersects": 0.5, "strain_max": 0.5, "residual": 2.0, "speed": 0.05}
+_LIMITS = {"body_intersects": 0.5, "self_intersects": 0.5, "strain_max": 0.5, "residual": 1.2, "speed": 0.05}
 _REACH = 0.95  # of the network's coordinates
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Which garment of a recipe. Training and test garments are numbered apart: neither moves the other."""
+
+    category: str
+    index: int
+    test: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name of a preset, or category and number."""
+        presets = list(CATEGORIES[self.category].presets)
+        if self.index < len(presets) and not self.test:
+            return presets[self.index]
+        return f"{self.category}_{'test_' if self.test else ''}{self.index:04d}"
+
+    @property
+    def file(self) -> str:
+        """File name in the category's folder."""
+        return f"{self.name}.npz" if self.test else f"{self.index:04d}_{self.name}.npz"
+
+    def parameters(self, seed: int, attempt: int) -> Any:
+        """A preset, the same at every attempt, or parameters drawn for this seed and attempt."""
+        spec = CATEGORIES[self.category]
+        if self.index < len(spec.presets) and not self.test:
+            return list(spec.presets.values())[self.index]
+        key = [seed, list(CATEGORIES).index(self.category), self.index, attempt, *([1] if self.test else [])]
+        return spec.sample(np.random.default_rng(key))
 
 
 @dataclass(frozen=True)
@@ -81,22 +112,17 @@ class GarmentMaker:
         """Origin of the network's coordinates [m]."""
         return np.array(CATEGORIES[category].panel_center(self.rest_body(category).landmarks))
 
-    def name(self, category: str, index: int) -> str:
-        """Name of a preset, or category and number."""
-        presets = list(CATEGORIES[category].presets)
-        return presets[index] if index < len(presets) else f"{category}_{index:04d}"
-
-    def path(self, category: str, index: int) -> Path:
+    def path(self, draft: Draft) -> Path:
         """File of a garment."""
-        return Path(self.recipe.out) / category / f"{index:04d}_{self.name(category, index)}.npz"
+        return Path(self.recipe.out) / draft.category / draft.file
 
-    def is_made(self, category: str, index: int) -> bool:
+    def is_made(self, draft: Draft) -> bool:
         """Whether the garment's file is there and whole.
 
         Raises:
             DatasetError: If it was made from another recipe.
         """
-        path = self.path(category, index)
+        path = self.path(draft)
         try:
             meta = read_garment_file(path)[1]
         except UNREADABLE:
@@ -109,7 +135,7 @@ class GarmentMaker:
             )
         return True
 
-    def make(self, category: str, index: int) -> str:
+    def make(self, draft: Draft) -> str:
         """Make one garment and its file; rejected drafts are drawn again and counted.
 
         Returns:
@@ -120,37 +146,27 @@ class GarmentMaker:
         """
         rejections: list[str] = []
         for attempt in range(_ATTEMPTS):
-            parameters = self._parameters(category, index, attempt)
+            parameters = draft.parameters(self.recipe.seed, attempt)
             try:
-                pattern, sewn, rest = self._try(category, parameters, attempt)
+                pattern, sewn, rest = self._try(draft.category, parameters, attempt)
             except GeometryError as error:
                 rejections.append(str(error))
                 continue
-            fault = self._fault(category, sewn, rest)
+            fault = self._fault(draft.category, sewn, rest)
             if fault is None:
                 break
             rejections.append(fault)
         else:
-            raise DatasetError(
-                f"garment {self.name(category, index)!r}: no good draft in {_ATTEMPTS}: {rejections}"
-            )
+            raise DatasetError(f"garment {draft.name!r}: no good draft in {_ATTEMPTS}: {rejections}")
         meta = {
-            "version": FILE_VERSION, "name": self.name(category, index), "category": category, "index": index,
+            "version": FILE_VERSION, "name": draft.name, "category": draft.category, "index": draft.index,
             "provenance": self._provenance(), "parameters": asdict(parameters), "metrics": rest.metrics,
             "rejections": rejections,
         }  # fmt: skip
-        _save(self.path(category, index), pattern, sewn, rest, meta)
+        _save(self.path(draft), pattern, sewn, rest, meta)
         note = f", {len(rejections)} rejected" if rejections else ""
         size, strain = len(rest.vertices), rest.metrics["strain_mean"]
-        return f"{category} {meta['name']}: {size} vertices, strain {strain:.1%}{note}"
-
-    def _parameters(self, category: str, index: int, attempt: int):
-        spec = CATEGORIES[category]
-        if index < len(spec.presets):
-            return list(spec.presets.values())[index]
-        return spec.sample(
-            np.random.default_rng([self.recipe.seed, list(CATEGORIES).index(category), index, attempt])
-        )
+        return f"{draft.category} {draft.name}: {size} vertices, strain {strain:.1%}{note}"
 
     def _try(self, category: str, parameters, attempt: int) -> tuple[Pattern, SewnPattern, RestShape]:
         body = self.rest_body(category)
@@ -160,7 +176,7 @@ class GarmentMaker:
         # A preset cannot be drawn again: a repeated try differs by settling longer.
         settings = DrapeSettings(
             substeps=1000 + 250 * attempt,
-            iterations=250 + 100 * attempt,
+            iterations=400 + 100 * attempt,
             margin=max(0.006, self.recipe.edge_length / 3),  # longer edges cut deeper into round shoulders
         )
         return pattern, sewn, drape_to_rest(sewn, body, settings)

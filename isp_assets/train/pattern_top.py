@@ -1,6 +1,6 @@
 """Patterns of shirts and jackets: sleeves in one piece with the torso, front open or closed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -58,6 +58,8 @@ class TopParameters:
     open: bool = False
     gap: float = 0.03
     """Half the distance between the fronts at the hem [m]."""
+    collar: float = 0.0
+    """Height of a stand collar about the neck [m]; 0 for none. With one, ``neck_width`` plays no part."""
 
 
 PRESETS = {
@@ -92,19 +94,25 @@ PRESETS = {
         sleeve=0.95, ease=0.28, hem=1.12, length=1.45, sleeve_ease=0.5, cuff=1.15, neck_width=1.6,
         neck_front=0.16, vee=0.7, shoulder_ease=0.02, armhole=0.035, open=True, gap=0.04,
     ),
+    "turtleneck": TopParameters(
+        sleeve=0.98, ease=0.12, length=0.66, sleeve_ease=0.3, neck_front=0.008, neck_back=0.004, collar=0.04,
+    ),
 }  # fmt: skip
 
 
 def sample_top(rng: np.random.Generator) -> TopParameters:
     """Draw random parameters."""
     u = rng.uniform
-    return TopParameters(
+    drawn = TopParameters(
         ease=u(0.06, 0.42), hem=u(0.95, 1.20), length=u(0.0, 1.15), shaping=u(0.0, 0.02),
         sleeve=0.0 if u() < 0.18 else u(0.12, 1.0), sleeve_ease=u(0.2, 0.75), cuff=u(0.95, 1.35),
         strap=u(0.52, 0.68),
         neck_width=u(1.25, 2.0), neck_front=u(0.05, 0.20), neck_back=u(0.005, 0.05), vee=u(0.0, 1.0),
         shoulder_ease=u(0.008, 0.03), armhole=u(0.01, 0.05), open=bool(u() < 0.28), gap=u(0.0, 0.05),
     )  # fmt: skip
+    if u() < 0.8:
+        return drawn
+    return replace(drawn, collar=u(0.02, 0.045), neck_front=u(0.004, 0.02), neck_back=u(0.002, 0.01))
 
 
 def draw_top(body: RestBody, standing: Landmarks, p: TopParameters) -> Pattern:
@@ -142,10 +150,10 @@ def _sleeveless(body: RestBody, p: TopParameters, hem: np.ndarray, under_arm: fl
     lm = body.landmarks
     under = np.array([under_arm, lm.armpit_y - p.armhole])
     shoulder_x = p.strap * lm.arm_x[0]
-    x = np.linspace(shoulder_x, lm.neck_x * p.neck_width + 0.01, 8)
+    x = np.linspace(shoulder_x, _neck_x(body, p), 8)
     over = np.stack([x, body.shoulder_line(x) + p.shoulder_ease], axis=1)
     armhole = bezier(under, (shoulder_x - 0.012, under[1] + 0.02), over[0])
-    return _side(lm, p, hem, under), PatternEdge(_CUFF, armhole), PatternEdge(_OVER, over)
+    return _side(lm, p, hem, under), PatternEdge(_CUFF, armhole), PatternEdge(_OVER, _with_collar(over, p))
 
 
 def _sleeved(body: RestBody, p: TopParameters, hem: np.ndarray, under_arm: float) -> Loop:
@@ -171,14 +179,14 @@ def _sleeved(body: RestBody, p: TopParameters, hem: np.ndarray, under_arm: float
         _side(lm, p, hem, under),
         PatternEdge(_UNDER, np.concatenate([bend, cuff[:1]])),
         PatternEdge(_CUFF, cuff),
-        PatternEdge(_OVER, _over_sleeve(body, p, cuff[1], sleeve_top)),
+        PatternEdge(_OVER, _with_collar(_over_sleeve(body, p, cuff[1], sleeve_top), p)),
     )
 
 
 def _over_sleeve(body: RestBody, p: TopParameters, cuff: np.ndarray, sleeve_top) -> Curve:
     """Along the shoulder's silhouette, and straight from the shoulder to the cuff."""
     lm = body.landmarks
-    x = np.linspace(cuff[0], lm.neck_x * p.neck_width + 0.01, 40)
+    x = np.linspace(cuff[0], _neck_x(body, p), 40)
     line = np.maximum(body.shoulder_line(x) + p.shoulder_ease, 0)
     shoulder = 0.9 * lm.arm_x[0]
     straight = np.interp(x, [shoulder, max(cuff[0], shoulder + 1e-3)], [sleeve_top(shoulder), cuff[1]])
@@ -186,6 +194,25 @@ def _over_sleeve(body: RestBody, p: TopParameters, cuff: np.ndarray, sleeve_top)
     smooth = np.maximum(gaussian_filter1d(line, 3, mode="nearest"), line - 0.004)
     smooth[0] = cuff[1]
     return np.stack([x, smooth], axis=1)
+
+
+def _neck_x(body: RestBody, p: TopParameters) -> float:
+    """Half width at the inner end of the shoulder: a collar leaves the neck a little room all round."""
+    lm = body.landmarks
+    if p.collar > 0:
+        return 0.25 * body.level_girth(lm.neck_y) * 1.12
+    return lm.neck_x * p.neck_width + 0.01
+
+
+def _with_collar(over: Curve, p: TopParameters) -> Curve:
+    """The shoulder's edge, led on up the neck in a small bend."""
+    if p.collar <= 0:
+        return over
+    corner = over[-1]
+    bend = min(0.015, 0.5 * p.collar)
+    kept = over[over[:, 0] > corner[0] + bend]
+    rounded = bezier(kept[-1], corner, (corner[0], corner[1] + bend), 6)
+    return np.concatenate([kept[:-1], rounded, [(corner[0], corner[1] + p.collar)]])
 
 
 def _half_neckline(shoulder: np.ndarray, depth: float, vee: float) -> Curve:

@@ -30,6 +30,8 @@ class PatternOptions:
 
     code_size: int = 32
     width: int = 128
+    depths: tuple[int, int, int] = (3, 6, 4)
+    """Layers: shared, then of the distance branch, and of the label branch."""
     label_weight: float = 0.01
     """lambda_CE of Eq. 2."""
     code_weight: float = 1e-4
@@ -42,7 +44,11 @@ class PatternOptions:
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
 
     def field_config(self, num_labels: int) -> PanelFieldConfig:
-        return PanelFieldConfig(num_labels=num_labels, code_size=self.code_size, width=self.width)
+        shared, distance, label = self.depths
+        return PanelFieldConfig(
+            num_labels, self.code_size, self.width, shared_depth=shared, distance_depth=distance,
+            label_depth=label,
+        )  # fmt: skip
 
 
 def train_patterns(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isp_assets.errors import GeometryError
-from isp_assets.evaluate import FIGURES, FrameMeter, edge_strain, summarise
+from isp_assets.evaluate.frames import FIGURES, FrameMeter, edge_strain, summarise
 from isp_assets.frames import FrameChunk
 from isp_assets.synthetic import SyntheticShot, synthetic_shot
 

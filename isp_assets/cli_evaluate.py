@@ -1,0 +1,91 @@
+"""The command line's measuring side. One function a verb; no logic."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+evaluate_app = typer.Typer(no_args_is_help=True, help="Measure networks and fits.")
+
+OutOption = Annotated[Path, typer.Option("--out", help="Output folder; made if missing.")]
+BundlesOption = Annotated[list[Path], typer.Option("--bundle", help="Garment bundle; repeat.")]
+DataOption = Annotated[Path, typer.Option("--data", help="Dataset folder with test garments.")]
+
+
+@evaluate_app.command("reconstruction")
+def reconstruction(
+    data: DataOption,
+    bundles: BundlesOption,
+    out: OutOption,
+    garments: Annotated[int, typer.Option(help="Garments measured, of training and of test each.")] = 20,
+    finest: Annotated[int, typer.Option(help="Of these, how many at the finest resolution.")] = 6,
+    resolutions: Annotated[str, typer.Option(help="Grid cells, separated by commas.")] = "128,256,512",
+    samples: Annotated[int, typer.Option(help="Points on each surface.")] = 100_000,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(help="FILE.py=ARGUMENT of a method to compare with; {category} is filled in. Repeat."),
+    ] = None,
+) -> None:
+    """Rest shapes against the true garments: distances, normals, seams, time and memory (Table 1)."""
+    from isp_assets.bundle import GarmentBundle
+    from isp_assets.evaluate.reconstruction import (
+        FIGURES,
+        PAPER_SHIRTS,
+        IspReconstructor,
+        ReconstructionOptions,
+        ReconstructionTable,
+        evaluate_reconstruction,
+        load_peer,
+    )
+    from isp_assets.evaluate.table import write_table
+    from isp_assets.train.dataset import load_dataset
+
+    options = ReconstructionOptions(
+        resolutions=tuple(int(r) for r in resolutions.split(",")), garments=garments, finest=finest,
+        samples=samples,
+    )  # fmt: skip
+    whole = ReconstructionTable()
+    for path in bundles:
+        bundle = GarmentBundle.load(path)
+        splits = {s: load_dataset(data, bundle.category, test=s == "test") for s in ("train", "test")}
+        methods: list[Any] = [IspReconstructor(bundle)]
+        methods += [load_peer(text, bundle.category) for text in peer or []]
+        with _bar() as report:
+            part = evaluate_reconstruction(methods, splits, options, progress=report)
+        whole.rows += part.rows
+        whole.garments += part.garments
+        rows = [*whole.rows, *PAPER_SHIRTS]
+        write_table(
+            out, "reconstruction", rows, meanings=FIGURES, details={"garments": whole.garments}
+        )  # after every category, so that a run that is cut off leaves what it has
+    _print("reconstruction", [*whole.rows, *PAPER_SHIRTS])
+
+
+def _bar() -> Any:
+    from collections.abc import Callable, Iterator
+    from contextlib import contextmanager
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    @contextmanager
+    def running() -> Iterator[Callable[[int, int, str], None]]:
+        columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task("starting", total=None)
+            yield lambda done, total, text: bar.update(task, completed=done, total=total, description=text)
+
+    return running()
+
+
+def _print(title: str, rows: Any) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from isp_assets.evaluate.table import cell
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*(cell(row.get(key)) for key in columns))
+    Console().print(table)

@@ -1,0 +1,1 @@
+"""Measure: draped frames (`frames`), rest shapes (`reconstruction`), any code at all (`robustness`)."""
