@@ -1,14 +1,17 @@
 """Collections: the built-in one is complete and lossless; wrong ones are named."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from isp_assets.body import Body
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
+from isp_assets.code_file import GarmentCode
 from isp_assets.collection import DEFAULT_FOLDER, FILE_NAME, Collection
-from isp_assets.errors import CollectionError, OutfitError
+from isp_assets.errors import BundleError, CollectionError, InputError, OutfitError
 
 EXPECTED = {"tank_top", "long_sleeved_shirt", "open_jacket", "trousers", "shorts", "a_line_skirt"}
 
@@ -119,3 +122,56 @@ def test_wrong_code_name(copy: Path) -> None:
     edit(copy, 'code = "tank_top"', 'code = "tank_topp"')
     with pytest.raises(CollectionError, match="names the code 'tank_topp'"):
         Collection.load(copy).item("tank_top")
+
+
+def garment_code(collection: Collection, name: str) -> GarmentCode:
+    bundle = collection.bundle("skirt.safetensors")
+    codes = list(bundle.codes.values())
+    return GarmentCode(name, "skirt", 0.5 * (codes[0] + codes[1]), bundle.model_sha256)
+
+
+def test_a_garment_is_added(copy: Path) -> None:
+    before = Collection.load(copy)
+    now = before.add(garment_code(before, "half_skirt"), color="#102030", fabric="denim")
+    assert now.names() == (*before.names(), "half_skirt")
+    assert now.entry("half_skirt").style.kind == "denim"
+    np.testing.assert_array_equal(now.item("half_skirt").code, garment_code(before, "x").code)
+    old, new = before.bundle("skirt.safetensors"), now.bundle("skirt.safetensors")
+    assert list(new.codes) == [*old.codes, "half_skirt"]
+    assert new.model_sha256 == old.model_sha256
+    assert new.drape_field is not None
+    assert now.item("half_skirt").bundle.decode(now.item("half_skirt").code, resolution=48).num_vertices > 100
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"name": "trousers"}, CollectionError, "has a garment 'trousers' already"),
+        ({"name": "a b"}, CollectionError, "letters, digits"),
+        ({"category": "hat"}, CollectionError, "no bundle of category 'hat'"),
+        ({"model_sha256": "0" * 64}, BundleError, "found with other networks"),
+    ],
+)
+def test_what_cannot_be_added_changes_nothing(copy: Path, change, error, message) -> None:
+    collection = Collection.load(copy)
+    files = {p.name: p.read_bytes() for p in copy.iterdir()}
+    with pytest.raises(error, match=message):
+        collection.add(replace(garment_code(collection, "half_skirt"), **change))
+    with pytest.raises(InputError, match="colour"):
+        collection.add(garment_code(collection, "half_skirt"), color="red")
+    assert {p.name: p.read_bytes() for p in copy.iterdir()} == files
+
+
+def test_the_built_in_collection_is_not_changed(collection: Collection) -> None:
+    with pytest.raises(CollectionError, match="built-in collection is not changed"):
+        collection.add(garment_code(collection, "half_skirt"))
+
+
+def test_a_copy_holds_the_same(collection: Collection, tmp_path: Path) -> None:
+    made = collection.copy_to(tmp_path / "mine")
+    assert made.names() == collection.names()
+    assert {p.name: p.read_bytes() for p in (tmp_path / "mine").iterdir()} == {
+        p.name: p.read_bytes() for p in DEFAULT_FOLDER.iterdir()
+    }
+    with pytest.raises(CollectionError, match="exists"):
+        collection.copy_to(tmp_path / "mine")

@@ -1,6 +1,8 @@
 """Data sets: what is stored, resuming, independence of the number of workers, bad files."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from isp_assets.conventions import PANELS
 from isp_assets.errors import DatasetError
 from isp_assets.train import garment_maker
 from isp_assets.train.dataset import load_dataset, make_dataset
-from isp_assets.train.garment_maker import CATEGORIES, GarmentMaker
+from isp_assets.train.dataset_sheet import draw_sheet
+from isp_assets.train.garment_maker import CATEGORIES, Draft, GarmentMaker
 
 pytest.importorskip("numba")
 pytest.importorskip("ipctk")
@@ -90,16 +93,50 @@ def test_garments_of_another_recipe_are_not_touched(folder):
 
 
 def test_random_garments_depend_on_seed_index_and_attempt_alone():
-    first = maker()._parameters("top", 12, 0)
-    assert first == maker()._parameters("top", 12, 0)
-    assert first != maker()._parameters("top", 13, 0)
-    assert first != maker()._parameters("top", 12, 1)
-    assert (
-        maker()._parameters("top", 0, 0)
-        == maker()._parameters("top", 0, 1)
-        == CATEGORIES["top"].presets["tank_top"]
-    )
-    assert maker().name("trousers", 9) == "trousers_0009"
+    first = Draft("top", 12).parameters(seed=0, attempt=0)
+    assert first == Draft("top", 12).parameters(0, 0)
+    assert first != Draft("top", 13).parameters(0, 0)
+    assert first != Draft("top", 12).parameters(0, 1)
+    assert first != Draft("top", 12).parameters(1, 0)
+    assert first != Draft("top", 12, test=True).parameters(0, 0)
+    preset = CATEGORIES["top"].presets["tank_top"]
+    assert Draft("top", 0).parameters(0, 0) == Draft("top", 0).parameters(0, 1) == preset
+    assert Draft("top", 0, test=True).parameters(0, 0) != preset
+    assert Draft("trousers", 9).file == "0009_trousers_0009.npz"
+    assert Draft("trousers", 9, test=True).file == "trousers_test_0009.npz"
+
+
+def test_test_garments_are_random_and_kept_apart(folder, tmp_path):
+    with pytest.raises(DatasetError, match="no test garments of 'skirt'"):
+        load_dataset(folder, "skirt", test=True)
+    shutil.copytree(folder, tmp_path / "data")
+    make_dataset(tmp_path / "data", counts={"skirt": 2}, test=1, seed=3, workers=1, edge_length=EDGE)
+    train, test = (load_dataset(tmp_path / "data", "skirt", test=t) for t in (False, True))
+    assert [g.name for g in train.garments] == ["mini_skirt", "pencil_skirt"]
+    assert [g.name for g in test.garments] == ["skirt_test_0000"]
+    assert test.garments[0].parameters != train.garments[0].parameters
+    assert (test.panel_scale, test.seam_pairs) == (train.panel_scale, train.seam_pairs)
+
+
+def test_collars_rise_along_the_neck():
+    """A higher collar makes the panel higher by just as much."""
+    body, preset = maker().rest_body("top"), CATEGORIES["top"].presets["turtleneck"]
+    tops = []
+    for height in (0.025, 0.045):
+        drawn = CATEGORIES["top"].draw(body, body.landmarks, replace(preset, collar=height))
+        tops.append(max(edge.points[:, 1].max() for edge in drawn.panels["back"][0]))
+    assert tops[1] - tops[0] == pytest.approx(0.020, abs=1e-9)
+
+
+def test_a_sheet_shows_a_random_sample(folder, tmp_path):
+    pytest.importorskip("matplotlib")
+    data = load_dataset(folder, "skirt")
+    names = draw_sheet(data, tmp_path / "a.png", count=2)
+    assert len(names) == 2
+    assert set(names) <= {g.name for g in data.garments}
+    assert draw_sheet(data, tmp_path / "b.png", count=2) == names
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert len(draw_sheet(data, tmp_path / "a.png", count=9)) == 3
 
 
 def test_bad_drafts_are_drawn_again_and_counted(tmp_path, monkeypatch):
@@ -136,7 +173,7 @@ def test_bad_files_are_named(tmp_path, folder):
     with pytest.raises(DatasetError, match="damaged"):
         load_dataset(tmp_path, "skirt")
     (tmp_path / "dataset.json").write_text('{"schema": "isp-assets/dataset", "version": 99}')
-    with pytest.raises(DatasetError, match="expected schema isp-assets/dataset version 1, got"):
+    with pytest.raises(DatasetError, match="expected schema isp-assets/dataset version 2, got"):
         load_dataset(tmp_path, "skirt")
     index = json.loads((folder / "dataset.json").read_text())
     (tmp_path / "dataset.json").write_text(json.dumps(index))

@@ -39,7 +39,7 @@ def test_cuts_of_the_texture_are_closed(tmp_path):
     """An OBJ with two texture coordinates at one vertex, as seams of a texture have."""
     path = tmp_path / "mesh.obj"
     lines = [f"v {x} {y} {z}" for x, y, z in VERTICES] + [f"vt 0.{k} 0.{k}" for k in range(1, 9)]
-    lines += ["f 1/1 2/2 3/3 4/4", "f 2/5 5/6 6/7 3/8"]
+    lines += ["f 1/1 2/2 3/3", "f 1/1 3/3 4/4", "f 2/5 5/6 6/7", "f 2/5 6/7 3/8"]
     path.write_text("\n".join(lines) + "\n")
     same(read_surface(path))
 
