@@ -38,8 +38,10 @@ def reconstruction(
         load_peer,
     )
     from isp_assets.evaluate.table import write_table
+    from isp_assets.train.cpu import prepare_cpu
     from isp_assets.train.dataset import load_dataset
 
+    prepare_cpu(1)
     options = ReconstructionOptions(
         resolutions=tuple(int(r) for r in resolutions.split(",")), garments=garments, finest=finest,
         samples=samples,
@@ -59,6 +61,38 @@ def reconstruction(
             out, "reconstruction", rows, meanings=FIGURES, details={"garments": whole.garments}
         )  # after every category, so that a run that is cut off leaves what it has
     _print("reconstruction", [*whole.rows, *PAPER_SHIRTS])
+
+
+@evaluate_app.command("decode")
+def decode(
+    bundles: BundlesOption,
+    out: OutOption,
+    data: Annotated[Path | None, typer.Option("--data", help="Dataset folder, for odd parameters.")] = None,
+    pairs: Annotated[int, typer.Option(help="Pairs of garments to mix.")] = 200,
+    steps: Annotated[int, typer.Option(help="Mixtures of a pair.")] = 50,
+    random: Annotated[int, typer.Option(help="Random codes at every radius.")] = 100,
+    seed: Annotated[int, typer.Option("--seed")] = 0,
+) -> None:
+    """Random, distant, mixed and odd codes at every resolution: how many give a good garment."""
+    from isp_assets.bundle import GarmentBundle
+    from isp_assets.evaluate.robustness import FIGURES, RobustnessOptions, evaluate_robustness
+    from isp_assets.evaluate.table import write_table
+    from isp_assets.train.cpu import prepare_cpu
+    from isp_assets.train.dataset import load_dataset
+
+    prepare_cpu(1)
+    options = RobustnessOptions(pairs=pairs, steps=steps, random=random, seed=seed)
+    rows: list[dict[str, Any]] = []
+    errors: list[dict[str, Any]] = []
+    for path in bundles:
+        bundle = GarmentBundle.load(path)
+        garments = None if data is None else load_dataset(data, bundle.category)
+        with _bar() as report:
+            found = evaluate_robustness(bundle, options, data=garments, progress=report)
+        rows += found.rows
+        errors += found.errors
+        write_table(out, "decode", rows, meanings=FIGURES, details={"errors": errors})
+    _print("decode", rows)
 
 
 def _bar() -> Any:

@@ -41,7 +41,9 @@ def mesh(
     from isp_assets.collection import Collection
     from isp_assets.fit import Fitter, choose_bundle
     from isp_assets.mesh_file import read_surface, write_surface
+    from isp_assets.train.cpu import prepare_cpu
 
+    prepare_cpu(1)
     surface = read_surface(target)
     loaded = Collection.load(collection)
     given = None if align == "auto" else Alignment.parse(align)

@@ -175,6 +175,27 @@ def drape(
     )
 
 
+@train_app.command("carry")
+def carry(
+    old: Annotated[Path, typer.Option("--from", help="Bundle whose displacement network is carried over.")],
+    bundle: Annotated[Path, typer.Option("--bundle", help="Bundle with new pattern networks.")],
+    out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
+    maps: Annotated[int | None, typer.Option(help="Fixed maps to keep; all if left out.")] = None,
+) -> None:
+    """Carry displacements over to retrained pattern networks, to train them further from there."""
+    from isp_assets.bundle import GarmentBundle
+    from isp_assets.train.carry import carry_displacement
+    from isp_assets.train.fewer_maps import keep_fewer_maps
+
+    carried = carry_displacement(GarmentBundle.load(old), GarmentBundle.load(bundle))
+    notes = carried.provenance["carried"]
+    typer.echo(f"{notes['garments']} garments shared; {notes['unexplained']:.1%} of their codes unexplained")
+    if maps is not None:
+        carried, lost = keep_fewer_maps(carried, maps)
+        typer.echo(f"{maps} maps lose {lost:.2%} of the mean square displacement")
+    carried.save(out)
+
+
 @train_app.command("layering")
 def layering(
     bundles: Annotated[

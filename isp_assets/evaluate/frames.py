@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 
 from isp_assets.errors import GeometryError
 from isp_assets.frames import FrameChunk, Layer, Scene
-from isp_assets.geometry.closest import SurfaceTopology, unit_face_normals
+from isp_assets.geometry.closest import SurfaceTopology
+from isp_assets.geometry.folds import folded_faces
 from isp_assets.geometry.intersection import Beneath, Intersection, measure_intersection
 from isp_assets.geometry.topology import hinges
 
@@ -121,13 +122,9 @@ class _LayerMeter:
     def shape_figures(self, vertices: Float[np.ndarray, "V 3"]) -> dict[str, float]:
         faces = self.topology.faces
         strain = np.abs(edge_strain(vertices, faces, self.corner_xy))
-        normals = unit_face_normals(vertices, faces)
-        around = np.zeros_like(normals)
-        for own, other in (self.pairs.T, self.pairs.T[::-1]):
-            np.add.at(around, own, normals[other])
         return {
             "strain_p99": float(np.percentile(strain, 99)),
-            "flipped_faces": float(((normals * around).sum(1) < 0).sum()),
+            "flipped_faces": float(folded_faces(vertices, faces, self.pairs).sum()),
         }
 
 

@@ -11,7 +11,7 @@ import runpy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -72,6 +72,7 @@ class Decoded:
     """Mean gap of the seams before sewing [m], where there are seams."""
 
 
+@runtime_checkable
 class Reconstructor(Protocol):
     """A way to get surfaces from codes and codes from surfaces, for one category."""
 

@@ -42,7 +42,7 @@ class DisplacementOptions:
     """What D_s is trained on."""
 
     network: DrapeFieldConfig = field(default_factory=DrapeFieldConfig)
-    """Size; its code size and code scale are replaced by the bundle's."""
+    """Size of a new network; code size and code scale are the bundle's."""
     wardrobe: WardrobeOptions = field(default_factory=WardrobeOptions)
     poses: PoseSource = field(default_factory=PoseSource)
     contact: Contact = field(default_factory=Contact)
@@ -70,8 +70,12 @@ class DisplacementTask:
         device: str = "cpu", seed: int = 0,
     ) -> None:  # fmt: skip
         codes = np.stack(list(bundle.codes.values()))
-        config = replace(
-            options.network, code_size=codes.shape[1], code_scale=float(1 / max(codes.std(), 1e-6))
+        scale = float(1 / max(codes.std(), 1e-6))
+        earlier = bundle.drape_field
+        config = (
+            earlier.config
+            if earlier
+            else replace(options.network, code_size=codes.shape[1], code_scale=scale)
         )
         torch.manual_seed(seed)
         self.name = f"drape {bundle.category}"
@@ -86,7 +90,10 @@ class DisplacementTask:
         samples = build_wardrobe(bundle, body, skin.skin_field, wardrobe, seed=seed)
         self.wardrobe = [sample.to(self.device) for sample in samples]
         self.clips = load_clips(options.poses)
-        self.module = _first_network(config, bundle.drape_field).to(self.device)
+        self.module = DrapeField(config)
+        if earlier is not None:
+            self.module.load_state_dict(earlier.state_dict())
+        self.module.to(self.device)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         rate = self.options.learning_rate
@@ -224,15 +231,6 @@ def train_displacement(
     result = with_displacement(bundle, out, metrics=metrics)
     result.save(Path(out) / f"{bundle.category}.safetensors")
     return result
-
-
-def _first_network(config: DrapeFieldConfig, earlier: DrapeField | None) -> DrapeField:
-    """A copy of the bundle's present network if it has this size, else an untrained one."""
-    network = DrapeField(config)
-    if earlier is not None and replace(earlier.config, code_scale=config.code_scale) == config:
-        network.config = earlier.config
-        network.load_state_dict(earlier.state_dict())
-    return network
 
 
 def with_displacement(

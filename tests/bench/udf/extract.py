@@ -54,6 +54,11 @@ class ExtractReport:
     """Points at which its gradient was evaluated too."""
     cells: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage], self._last = now - self._last, now
 
 
 def extract_mesh(
@@ -89,38 +94,27 @@ def extract_surface(
         floor: What the field says on the surface itself, where it should say 0.
     """
     options, report = options or ExtractOptions(), ExtractReport()
-    clock = _Clock(report)
     cells = _active_cells(distance, resolution, options, floor, report)
-    clock.lap("search")
+    report.lap("search")
     keys, corner = np.unique(_key(cells[:, None] + _CORNERS, resolution), return_inverse=True)
     corner = corner.reshape(-1, 8)
     points = _from_key(keys, resolution) * (2 / resolution) - 1
     values, directions = _evaluate(distance, points, options.chunk)
     report.gradients += len(points)
-    clock.lap("gradients")
+    report.lap("gradients")
     signs = _pseudo_signs(values[corner], directions[corner])
     kept = _crossed(values[corner], signs, options.stretch * 2 / resolution + 2 * floor)
     report.cells = int(kept.sum())
     vertices, faces = _march(cells[kept], signs[kept], keys, values, resolution)
-    clock.lap("march")
+    report.lap("march")
     if options.snap and len(vertices):
         values, directions = _evaluate(distance, vertices, options.chunk)
         report.gradients += len(vertices)
         vertices = vertices - np.clip(values - floor, 0, 1 / resolution)[:, None] * directions
-    clock.lap("snap")
+    report.lap("snap")
     vertices, faces = clean_mesh(vertices, faces, fill=options.fill)
-    clock.lap("clean")
+    report.lap("clean")
     return vertices, faces, report
-
-
-class _Clock:
-    def __init__(self, report: ExtractReport) -> None:
-        self._report, self._last = report, time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self._report.seconds[stage] = now - self._last
-        self._last = now
 
 
 def _active_cells(

@@ -1,4 +1,8 @@
-"""The baseline as a comparison sees it: codes to meshes and meshes to codes."""
+"""The baseline as a comparison sees it: codes to surfaces and surfaces to codes.
+
+A peer for ``isp-assets evaluate reconstruction``, with ``tests`` on PYTHONPATH:
+``--peer tests/bench/udf/reconstructor.py=RUNS/{category}``.
+"""
 
 from pathlib import Path
 
@@ -8,6 +12,8 @@ from bench.udf.extract import ExtractReport, extract_mesh
 from bench.udf.field import UdfConfig, UdfField
 from bench.udf.fit import FitOptions, fit_code
 
+from isp_assets.evaluate.reconstruction import Decoded
+from isp_assets.geometry.surface_distance import Surface
 from isp_assets.train.loop import CHECKPOINT, read_checkpoint
 
 
@@ -39,12 +45,18 @@ class UdfReconstructor:
         codes = dict(zip(config["garments"], weights["codes"].numpy(), strict=True))
         return cls(field_.to(device), codes)
 
-    def decode(self, code: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [V, 3] in metres and faces [F, 3] of the garment of a code."""
+    def decode(self, code: np.ndarray, resolution: int) -> Decoded:
+        """The surface of a code; GeometryError if there is none."""
         vertices, faces, self.report = extract_mesh(self.field, code, resolution)
-        return vertices, faces
+        return Decoded(Surface(vertices, faces))
 
-    def fit(self, vertices: np.ndarray, faces: np.ndarray, options: FitOptions | None = None) -> np.ndarray:
-        """The code of a garment given as vertices [V, 3] in metres and faces [F, 3]."""
+    def fit(self, surface: Surface, options: FitOptions | None = None) -> np.ndarray:
+        """The code of an unseen surface."""
         known = torch.from_numpy(np.stack(list(self.codes.values()))).to(self.field.floor.device)
-        return fit_code(self.field, vertices, faces, known, options)
+        return fit_code(self.field, surface.vertices, surface.faces, known, options)
+
+
+def reconstructor(argument: str, category: str) -> UdfReconstructor:
+    """The baseline of a folder; the peer that the command line asks for."""
+    del category  # the folder is that of one category
+    return UdfReconstructor.load(Path(argument))
