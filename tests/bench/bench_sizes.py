@@ -1,0 +1,126 @@
+"""Accuracy against decode time for networks of several sizes, each trained as long as the others.
+
+Run:  python tests/bench/bench_sizes.py --data DATA --category trousers --minutes 6 --out outputs/sizes
+
+Minutes are those of one size, half for the patterns and half for the atlas. Finished sizes
+are kept: run again to go on. A size that has not converged in its minutes says so by its
+number of steps; the curve tells what a budget buys, not what a size can reach.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isp_assets.bundle import GarmentBundle
+from isp_assets.decode import decode_garment
+from isp_assets.evaluate.reconstruction import (
+    IspReconstructor,
+    ReconstructionOptions,
+    evaluate_reconstruction,
+)
+from isp_assets.evaluate.table import write_table
+from isp_assets.train.atlas import AtlasOptions, train_atlas
+from isp_assets.train.cpu import prepare_cpu
+from isp_assets.train.dataset import load_dataset
+from isp_assets.train.loop import CHECKPOINT, RunOptions
+from isp_assets.train.patterns import PatternOptions, train_patterns
+
+SIZES: dict[str, tuple[int, tuple[int, int, int], int]] = {
+    "64 wide, shallow": (64, (2, 4, 3), 5),
+    "96 wide": (96, (3, 6, 4), 7),
+    "128 wide": (128, (3, 6, 4), 7),
+    "256 wide (paper)": (256, (3, 6, 4), 7),
+}
+"""Width, layers of the panel field (shared, distance, label), layers of the atlas."""
+
+MEANINGS = {
+    "parameters": "of both panel fields and both atlases",
+    "kib": "their size at 16 bits",
+    "steps": "of patterns and atlas together",
+    "border_mm": "how far the border is off, mean",
+    "vertex_mm": "how far rest positions are off at known pattern points, mean",
+    "seam_mm": "gap of the seams before sewing, mean",
+    "decode_ms": "decode at 256 cells, median",
+    "train_mean_mm": "point to triangle, both ways, training garments at 128 cells",
+    "train_nc_percent": "their normal consistency",
+}
+
+
+def train_size(name: str, options: argparse.Namespace) -> GarmentBundle:
+    """Train a size, or take it up where an earlier run left it."""
+    width, depths, atlas_depth = SIZES[name]
+    folder = options.out / name.split(" (")[0].replace(", ", "_").replace(" ", "_")
+    data = load_dataset(options.data, options.category)
+    run = RunOptions(minutes=options.minutes / 2, resume=True)
+    train_patterns(data, folder / "patterns", run=run, options=PatternOptions(width=width, depths=depths))
+    sizes = replace(AtlasOptions(), width=width, depth=atlas_depth)
+    train_atlas(data, folder / "patterns" / CHECKPOINT, folder / "atlas", run=run, options=sizes)
+    return GarmentBundle.load(folder / "atlas" / f"{options.category}.safetensors")
+
+
+def measure(name: str, bundle: GarmentBundle, options: argparse.Namespace) -> dict[str, Any]:
+    """The row of a trained size."""
+    networks = [*bundle.model.panel_fields.values(), *bundle.model.atlases.values()]
+    parameters = sum(p.numel() for network in networks for p in network.parameters())
+    times = []
+    for code in list(bundle.codes.values())[:8]:
+        began = time.perf_counter()
+        decode_garment(bundle.model, code, resolution=256)
+        times.append(time.perf_counter() - began)
+    data = load_dataset(options.data, options.category)
+    few = ReconstructionOptions(resolutions=(128,), garments=10, finest=10, samples=20_000)
+    table = evaluate_reconstruction([IspReconstructor(bundle)], {"train": data}, few)
+    return {
+        "size": name, "parameters": parameters, "kib": 2 * parameters // 1024,
+        "steps": bundle.provenance["patterns"]["step"] + bundle.provenance["atlas"]["step"],
+        "border_mm": bundle.metrics["patterns"]["border_mm"],
+        "vertex_mm": bundle.metrics["atlas"]["vertex_mm"], "seam_mm": bundle.metrics["atlas"]["seam_mm"],
+        "decode_ms": 1e3 * float(np.median(times)), "train_mean_mm": table.rows[0]["mean_mm"],
+        "train_nc_percent": table.rows[0]["nc_percent"],
+    }  # fmt: skip
+
+
+def draw(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """Accuracy over decode time, a point a size."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for key in ("train_mean_mm", "vertex_mm", "border_mm"):
+        axes.plot([r["decode_ms"] for r in rows], [r[key] for r in rows], marker="o", label=MEANINGS[key])
+    for row in rows:
+        axes.annotate(row["size"], (row["decode_ms"], row["train_mean_mm"]), xytext=(4, 6),
+                      textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.set(xlabel="decode at 256 cells [ms]", ylabel="mm", title=title, ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--category", default="trousers")
+    parser.add_argument("--minutes", type=float, default=6, help="training time of a size")
+    parser.add_argument("--out", type=Path, default=Path("outputs/sizes"))
+    options = parser.parse_args()
+    prepare_cpu(1)
+    bundles = {name: train_size(name, options) for name in SIZES}
+    rows = [measure(name, bundle, options) for name, bundle in bundles.items()]
+    for row in rows:
+        print(row)
+    details = {"category": options.category, "minutes": options.minutes}
+    write_table(options.out, "sizes", rows, meanings=MEANINGS, details=details)
+    draw(
+        rows, options.out / "sizes.png", f"{options.category}, {options.minutes:g} minutes of training a size"
+    )
+
+
+if __name__ == "__main__":
+    main()
