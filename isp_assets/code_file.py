@@ -53,7 +53,9 @@ class GarmentCode:
         """
         tensors, manifest = load_tensors(path, schema=_SCHEMA, version=_VERSION)
         try:
-            code, facts = tensors["code"].numpy(), [manifest[k] for k in ("name", "category", "model_sha256")]
-            return cls(*facts[:2], code, facts[2], manifest["notes"])
+            return cls(
+                manifest["name"], manifest["category"], tensors["code"].numpy(), manifest["model_sha256"],
+                manifest["notes"],
+            )  # fmt: skip
         except KeyError as error:
             raise BundleError(f"{path}: the file lacks {error}; it is damaged") from error

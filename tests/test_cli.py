@@ -43,6 +43,45 @@ def test_plugins_lists_versions() -> None:
     assert "broken" not in done.stdout
 
 
+def test_a_mesh_is_fitted_and_added(tmp_path: Path) -> None:
+    """A skirt of the collection, exported in centimetres with Z up, becomes a garment of a new collection."""
+    from isp_assets import Collection
+    from isp_assets.code_file import GarmentCode
+    from isp_assets.geometry.surface_distance import Surface
+    from isp_assets.mesh_file import read_surface, write_surface
+
+    garment = Collection.load("default").bundle("skirt.safetensors").decode("pencil_skirt", resolution=64)
+    z_up = garment.rest_vertices[:, [0, 2, 1]] * [100, -100, 100]
+    write_surface(tmp_path / "found.obj", Surface(z_up, garment.faces))
+    done = run(
+        "fit", "mesh", tmp_path / "found.obj", "-o", tmp_path / "code.safetensors", "--category", "skirt",
+        "--add-to", tmp_path / "mine", "--preview", tmp_path / "preview.ply",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "skirt, read in cm, z up" in done.stdout
+    code = GarmentCode.load(tmp_path / "code.safetensors")
+    assert code.notes["distance_m"]["mean"] < 2e-3
+    mine = Collection.load(tmp_path / "mine")
+    assert mine.names()[-1] == "found"
+    assert (mine.item("found").code == code.code).all()
+    assert len(read_surface(tmp_path / "preview.ply").faces) > 100
+    again = run("fit", "mesh", tmp_path / "found.obj", "-o", tmp_path / "x.safetensors", "--align", "furlong")
+    assert again.returncode == 3
+    assert "not an alignment" in again.stderr or "unit must be" in again.stderr
+
+
+@pytest.mark.slow
+def test_codes_are_evaluated(tmp_path: Path) -> None:
+    bundle = Path(__file__).parents[1] / "isp_assets/data/collection/skirt.safetensors"
+    done = run(
+        "evaluate", "decode", "--bundle", bundle, "--out", tmp_path, "--pairs", "1", "--steps", "2",
+        "--random", "1",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"decode.csv", "decode.json", "decode.md"}
+    assert "own codes" in (tmp_path / "decode.md").read_text()
+
+
 def test_garments_lists_the_collection() -> None:
     assert "open_jacket" in run("garments").stdout
 
@@ -57,6 +96,9 @@ def test_garments_lists_the_collection() -> None:
         (("drape", "{job}", "--out", "o", "--steps", "skin,glue"), 4, "steps must be some of"),
         (("drape", "{job}"), 2, "Missing option"),
         (("garments", "nowhere"), 3, "no such file"),
+        (("fit", "mesh", "none.obj", "-o", "c.safetensors"), 3, "no such file: none.obj"),
+        (("fit", "mesh", "{job}", "-o", "c.safetensors"), 3, "meshes are read from"),
+        (("evaluate", "decode", "--bundle", "none", "--out", "o"), 3, "no such file"),
         (("train", "patterns", "--data", "x", "--category", "top", "--out", "o"), 5, "steps or of minutes"),
     ],
 )

@@ -214,9 +214,13 @@ def _measure(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Figures of one garment at every resolution."""
     truth = garment_surface(garment)
-    head = {"method": method.name, "category": garment.category, "split": split, "garment": garment.name}
+    head: dict[str, Any] = {
+        "method": method.name,
+        "category": garment.category,
+        "split": split,
+        "garment": garment.name,
+    }
     try:
-        head |= {"code": None}
         began = time.perf_counter()
         if split == "train":
             if garment.name not in method.codes:
