@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from isp_assets.conventions import PANELS
@@ -150,24 +150,59 @@ def plane_field(network: PanelField, code: Float[np.ndarray, " Z"]) -> PlaneFiel
     return PlaneField(distance, border)
 
 
+@dataclass(frozen=True, eq=False)
+class BorderSlope:
+    """How the border points of a panel follow the zero level as the code leaves that of the cut (Eq. 5)."""
+
+    points: Int[Tensor, " B"]
+    """Panel points on the border."""
+    distance: Float[Tensor, " B"]
+    """Signed distance there at the code of the cut."""
+    step: Float[Tensor, "B 2"]
+    """Motion for each unit that the signed distance falls: ``grad s / |grad s|^2``."""
+
+
+def border_slopes(model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"]) -> dict[str, BorderSlope]:
+    """Prepare the border of both panels to follow the code, by panel.
+
+    Args:
+        model: The category's networks, at the precision of ``code``.
+        sewn: Flat panels [network units].
+        code: The code that they were cut at.
+    """
+    slopes = {}
+    for side, panel in sewn.panels.items():
+        border = torch.from_numpy(np.flatnonzero(panel.border_label))
+        xy = torch.from_numpy(panel.points).to(code)[border].requires_grad_()
+        with torch.enable_grad():
+            distance = model.panel_fields[side].signed_distance(xy, code.detach())
+            (slope,) = torch.autograd.grad(distance.sum(), xy)
+        step = slope / (slope**2).sum(dim=-1, keepdim=True).clamp_min(0.1)
+        slopes[side] = BorderSlope(border, distance.detach(), step)
+    return slopes
+
+
 def lift_points(
-    model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *, cut_code: Tensor | None = None
-) -> dict[str, Float[Tensor, "P 3"]]:
+    model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *,
+    border: Mapping[str, BorderSlope] | None = None,
+) -> dict[str, Float[Tensor, "P 3"]]:  # fmt: skip
     """Map every panel point to the rest body [m] (Eq. 3); differentiable in the code.
 
     Args:
         model: The category's networks, at the precision of ``code``.
         sewn: Flat panels [network units].
         code: Latent code.
-        cut_code: The code that the panels were cut at. Given it, border points move with
-            the zero level as the code leaves it, and gradients are those of Eq. 5;
-            without it the panels keep their outlines.
+        border: What `border_slopes` gives for the code that the panels were cut at. With it,
+            border points move with the zero level as the code leaves that one, and gradients
+            are those of Eq. 5; without it the panels keep their outlines.
     """
     lifted = {}
     for side, panel in sewn.panels.items():
         xy = torch.from_numpy(panel.points).to(code)
-        if cut_code is not None:
-            xy = _follow_border(model.panel_fields[side], panel, xy, code, cut_code)
+        if border is not None:
+            slope = border[side]
+            risen = model.panel_fields[side].signed_distance(xy[slope.points], code) - slope.distance
+            xy = xy.index_add(0, slope.points, -slope.step * risen[:, None])
         lifted[side] = model.atlases[side](xy, code)
     return lifted
 
@@ -185,21 +220,6 @@ def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) ->
         follow = (weights[..., None] * move[torch.from_numpy(fade.sources)]).sum(dim=1)
         welded = welded.index_add(0, vertex[torch.from_numpy(fade.points)], follow)
     return welded
-
-
-def _follow_border(
-    network: PanelField, panel: FlatPanel, xy: Float[Tensor, "P 2"], code: Float[Tensor, " Z"],
-    cut_code: Float[Tensor, " Z"],
-) -> Float[Tensor, "P 2"]:  # fmt: skip
-    """Add ``-grad s (s(x, z) - s(x, z0)) / |grad s|^2`` on the border: 0 at ``z0``, sloped as in Eq. 5."""
-    border = torch.from_numpy(np.flatnonzero(panel.border_label))
-    points = xy[border].detach().requires_grad_()
-    with torch.enable_grad():
-        value = network.signed_distance(points, cut_code.detach())
-        (slope,) = torch.autograd.grad(value.sum(), points)
-    step = slope / (slope**2).sum(dim=-1, keepdim=True).clamp_min(0.1)
-    moved = network.signed_distance(xy[border], code) - value.detach()
-    return xy.index_add(0, border, -step * moved[:, None])
 
 
 def _check(model: GarmentModel, code: Float[np.ndarray, " Z"], resolution: int) -> Float[np.ndarray, " Z"]:

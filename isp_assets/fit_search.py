@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 from torch import Tensor
 
-from isp_assets.decode import SLIVER, cut_panels, lift_points, weld_points
+from isp_assets.decode import SLIVER, border_slopes, cut_panels, lift_points, weld_points
 from isp_assets.errors import DecodeError, GeometryError
 from isp_assets.fit_objective import Distance, FitWeights, Target
 from isp_assets.garment_model import GarmentModel
@@ -142,6 +142,7 @@ class Search:
         options = self.options
         cut_code = self._tensor_code(torch.from_numpy(cut_at).float())
         sewn = self._sew(cut_code.numpy())
+        border = border_slopes(self.model, sewn, cut_code)
         distance = Distance(
             self.target, sewn.faces, _flat_areas(sewn), samples=options.samples, weights=options.weights
         )
@@ -151,7 +152,7 @@ class Search:
             variable = torch.from_numpy(variables).float().requires_grad_()
             white, shift = variable[:-3], _SHIFT_UNIT * variable[-3:]
             code = self._tensor_code(white)
-            vertices = weld_points(sewn, lift_points(self.model, sewn, code, cut_code=cut_code))
+            vertices = weld_points(sewn, lift_points(self.model, sewn, code, border=border))
             energy = distance(vertices + shift) + options.weights.prior * white.square().mean()
             (gradient,) = torch.autograd.grad(energy, variable)
             return energy.item(), gradient.double().numpy()

@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isp_assets.decode import (
+    border_slopes,
     cut_panels,
     decode_garment,
     decode_with_report,
@@ -213,7 +214,7 @@ def test_lift_moves_the_border_with_the_code():
     code = torch.zeros(2, requires_grad=True)
 
     def vertices(z):
-        return weld_points(sewn, lift_points(model, sewn, z, cut_code=code))
+        return weld_points(sewn, lift_points(model, sewn, z, border=border_slopes(model, sewn, code)))
 
     values = vertices(code)
     by_radius, by_shift = (
@@ -240,7 +241,7 @@ def test_gradient_of_the_lift_agrees_with_decoding_again(skirt):
     cut = cut_panels(skirt, base, resolution=32)
     sewn = sew_panels(cut.outlines, SKIRT_SEAMS, spacing=1 / 16, sliver=0.06)
     code = torch.tensor(base, dtype=torch.float32, requires_grad=True)
-    lifted = lift_points(skirt, sewn, code, cut_code=code)["front"]
+    lifted = lift_points(skirt, sewn, code, border=border_slopes(skirt, sewn, code))["front"]
     run = dict(sewn.panels["front"].runs)[1]
     (gradient,) = torch.autograd.grad(lifted[run[len(run) // 2], 1], code)
     low, high = (

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from isp_assets.collection import Collection
-from isp_assets.decode import SLIVER, cut_panels, lift_points, weld_points
+from isp_assets.decode import SLIVER, border_slopes, cut_panels, lift_points, weld_points
 from isp_assets.garment_model import GarmentModel
 from isp_assets.geometry.sewing import SewnPanels, sew_panels
 
@@ -52,7 +52,7 @@ def test_gradients_agree_with_finite_differences(garment, kind):
     assert len(rows) >= 5
 
     def vertices(z: Tensor) -> Tensor:
-        return weld_points(sewn, lift_points(model, sewn, z, cut_code=code))[rows]
+        return weld_points(sewn, lift_points(model, sewn, z, border=border_slopes(model, sewn, code)))[rows]
 
     start = (code + 0.01).requires_grad_()
     assert torch.autograd.gradcheck(vertices, start, eps=1e-6, atol=1e-7, rtol=1e-4)
@@ -94,7 +94,9 @@ def test_border_points_stay_on_the_zero_level(garment, side):
         expected = (ends[1] - ends[0]) / (2 * step)
 
     def lifted(z: Tensor) -> Tensor:
-        return lift_points(model, sewn, z, cut_code=code)[side][torch.from_numpy(border)]
+        return lift_points(model, sewn, z, border=border_slopes(model, sewn, code))[side][
+            torch.from_numpy(border)
+        ]
 
     _, found = torch.autograd.functional.jvp(lifted, code, direction)
     error = (found - expected).norm(dim=-1)[steep] / expected.norm(dim=-1).mean()
@@ -106,7 +108,7 @@ def test_border_points_stay_on_the_zero_level(garment, side):
 
 def test_without_a_cut_code_the_outline_stays(garment):
     model, sewn, code = garment
-    moved = lift_points(model, sewn, code + 0.02, cut_code=code)
+    moved = lift_points(model, sewn, code + 0.02, border=border_slopes(model, sewn, code))
     kept = lift_points(model, sewn, code + 0.02)
     for side, panel in sewn.panels.items():
         inside = torch.from_numpy(panel.border_label == 0)
