@@ -188,8 +188,8 @@ def carry(
     from isp_assets.train.fewer_maps import keep_fewer_maps
 
     carried = carry_displacement(GarmentBundle.load(old), GarmentBundle.load(bundle))
-    notes = carried.provenance["carried"]
-    typer.echo(f"{notes['garments']} garments shared; {notes['unexplained']:.1%} of their codes unexplained")
+    if notes := carried.provenance.get("carried"):
+        typer.echo(f"{notes['garments']} garments shared; {notes['unexplained']:.1%} of codes unexplained")
     if maps is not None:
         carried, lost = keep_fewer_maps(carried, maps)
         typer.echo(f"{maps} maps lose {lost:.2%} of the mean square displacement")

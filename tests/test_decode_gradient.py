@@ -93,10 +93,10 @@ def test_border_points_stay_on_the_zero_level(garment, side):
             ends.append(atlas(xy, z))
         expected = (ends[1] - ends[0]) / (2 * step)
 
+    slopes = border_slopes(model, sewn, code)
+
     def lifted(z: Tensor) -> Tensor:
-        return lift_points(model, sewn, z, border=border_slopes(model, sewn, code))[side][
-            torch.from_numpy(border)
-        ]
+        return lift_points(model, sewn, z, border=slopes)[side][torch.from_numpy(border)]
 
     _, found = torch.autograd.functional.jvp(lifted, code, direction)
     error = (found - expected).norm(dim=-1)[steep] / expected.norm(dim=-1).mean()

@@ -67,11 +67,22 @@ def test_codes_without_relation_are_not_explained():
     assert np.linalg.norm(found.matrix) < 0.5, "the ridge keeps a map of noise small"
 
 
+def test_with_the_same_codes_the_network_is_taken_as_it_is():
+    codes = np.random.default_rng(0).uniform(-0.05, 0.05, (3, 2))
+    notes = {"provenance": {"drape": {"step": 7}}, "metrics": {"drape": {"gap": 1.0}}}
+    old = bundle(codes, drape_field=random_field(), **notes)
+    carried = carry_displacement(old, bundle(codes, provenance={"atlas": {"step": 9}}))
+    assert carried.drape_field is old.drape_field
+    assert carried.provenance == {"atlas": {"step": 9}, "drape": {"step": 7}}
+    assert carried.metrics == notes["metrics"]
+
+
 def test_a_bundle_takes_over_the_displacements_of_another():
     rng = np.random.default_rng(0)
     codes = rng.uniform(-0.05, 0.05, (12, 2))
     old = bundle(codes, drape_field=random_field(), provenance={"drape": {"step": 7}})
-    carried = carry_displacement(old, bundle(codes))
+    more = bundle(np.concatenate([codes, [[0.0, 0.01]]]))
+    carried = carry_displacement(old, more)
     assert carried.provenance["carried"]["garments"] == 12
     assert carried.provenance["carried"]["earlier"] == {"step": 7}
     code = torch.from_numpy(codes[3]).float()
@@ -92,7 +103,7 @@ def test_bundles_that_share_too_little_are_refused():
     with pytest.raises(TrainError, match="no displacement network"):
         carry_displacement(bundle(codes), bundle(codes))
     with pytest.raises(TrainError, match="share 4 garments"):
-        carry_displacement(bundle(codes, drape_field=random_field()), bundle(codes))
+        carry_displacement(bundle(codes, drape_field=random_field()), bundle(np.zeros((5, 2))))
 
 
 def test_maps_that_are_combinations_of_others_cost_nothing():

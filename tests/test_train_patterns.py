@@ -10,7 +10,7 @@ from isp_assets.errors import DatasetError, TrainError
 from isp_assets.train.assemble import assemble_bundle
 from isp_assets.train.atlas import AtlasOptions, AtlasTask, train_atlas
 from isp_assets.train.atlas_metrics import measure_atlases
-from isp_assets.train.atlas_samples import AtlasSamples, places, seam_indices
+from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places, seam_indices
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint
 from isp_assets.train.pattern_metrics import measure_fields
 from isp_assets.train.patterns import PatternOptions, dataset_digest, panel_outline, train_patterns
@@ -132,6 +132,31 @@ def test_seam_samples_lie_on_both_panels():
     triangles = samples.triangles("back", torch.tensor([1]), 20, torch.Generator().manual_seed(0))
     assert triangles.shape == (1, 20, 3, 5)
     assert (triangles[..., 4] < 1e-6).all()
+
+
+def test_triangles_are_small_copies_of_those_of_the_mesh():
+    """Inside one of the mesh's triangles each, with its normal; their middles spread over it."""
+    dataset = tube_dataset((0.4,))
+    garment = dataset.garments[0]
+    samples = AtlasSamples(dataset, torch.device("cpu"))
+    drawn = samples.triangles("front", torch.tensor([0]), 4000, torch.Generator().manual_seed(0))[0].numpy()
+    panel = garment.panels["front"]
+    mesh = np.concatenate([network_xy(dataset, garment, "front"), places(garment, "front")], axis=1)[
+        panel.faces
+    ]
+    middle = drawn.mean(axis=1)
+    system = np.concatenate([mesh[..., :2], np.ones((len(mesh), 3, 1))], axis=2).transpose(0, 2, 1)
+    weights = np.linalg.inv(system) @ np.append(middle[:, :2], np.ones((len(middle), 1)), axis=1).T  # F 3 n
+    face = weights.min(axis=1).argmax(axis=0)
+    inside = weights[face, :, np.arange(len(middle))]
+    assert inside.min() > -1e-5
+    np.testing.assert_allclose(inside.mean(axis=0), 1 / 3, atol=0.02)
+    np.testing.assert_allclose(np.einsum("nk,nkc->nc", inside, mesh[face]), middle, atol=1e-5)
+    sizes = np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=1) / np.linalg.norm(
+        mesh[face, 1] - mesh[face, 0], axis=1
+    )
+    assert 0.19 < sizes.min() < 0.25
+    assert 0.95 < sizes.max() < 1.001
 
 
 def test_seam_indices_match():

@@ -26,6 +26,9 @@ def seam_indices(garment: TrainingGarment) -> dict[str, Int[np.ndarray, " n"]]:
     return dict(zip(PANELS, points, strict=True))
 
 
+_SMALLEST = 0.2  # of a triangle of the mesh
+
+
 class AtlasSamples:
     """All triangles and seam vertices of a dataset, drawn from at random.
 
@@ -50,8 +53,19 @@ class AtlasSamples:
     def triangles(
         self, side: str, garment: Int[Tensor, " G"], count: int, generator: torch.Generator
     ) -> Float[Tensor, "G count 3 5"]:
-        """Corners of random triangles: network coordinates, then place on the body [m]."""
-        return self._triangles[side].draw(garment, count, generator).unflatten(-1, (3, 5))
+        """Corners of random triangles: network coordinates, then place on the body [m].
+
+        Each is a smaller copy of a triangle of the mesh somewhere inside it. Corners of the mesh
+        alone would leave the network free to ripple between them.
+        """
+        whole = self._triangles[side].draw(garment, count, generator).unflatten(-1, (3, 5))
+        shape = whole.shape[:2]
+        weights = (
+            -torch.rand(*shape, 3, 1, generator=generator).clamp_min(1e-6).log()
+        )  # uniform in the triangle
+        size = _SMALLEST + (1 - _SMALLEST) * torch.rand(*shape, 1, 1, generator=generator)
+        middle = (weights / weights.sum(dim=2, keepdim=True)).to(whole) * whole
+        return torch.lerp(middle.sum(dim=2, keepdim=True), whole, size.to(whole))
 
     def seams(
         self, garment: Int[Tensor, " G"], count: int, generator: torch.Generator

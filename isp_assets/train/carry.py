@@ -34,13 +34,19 @@ class CodeMap:
 
 
 def carry_displacement(old: GarmentBundle, new: GarmentBundle) -> GarmentBundle:
-    """The new bundle with the old one's displacement network.
+    """The new bundle with the old one's displacement network; as it is where the codes are the same.
 
     Raises:
         TrainError: If the old bundle has no such network, or the two share too few garments.
     """
     if old.drape_field is None:
         raise TrainError(f"the old bundle {old.category!r} has no displacement network to carry over")
+    if _same_codes(old, new):  # the atlas alone was trained further
+        notes = {key: old.provenance[key] for key in ("drape", "carried") if key in old.provenance}
+        metrics = {**new.metrics, "drape": old.metrics.get("drape", {})}
+        return replace(
+            new, drape_field=old.drape_field, provenance={**new.provenance, **notes}, metrics=metrics
+        )
     names = shared_garments(old, new)
     if len(names) < _FEWEST:
         raise TrainError(
@@ -55,6 +61,12 @@ def carry_displacement(old: GarmentBundle, new: GarmentBundle) -> GarmentBundle:
         new,
         drape_field=recoded(old.drape_field, found, code_scale=scale),
         provenance={**new.provenance, "carried": notes},
+    )
+
+
+def _same_codes(old: GarmentBundle, new: GarmentBundle) -> bool:
+    return list(old.codes) == list(new.codes) and all(
+        np.array_equal(code, new.codes[name]) for name, code in old.codes.items()
     )
 
 
