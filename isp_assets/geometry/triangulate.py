@@ -100,14 +100,16 @@ def _fill(loop: Float[np.ndarray, "n 2"], spacing: float, *, where: str):
     for a, b in _missing_edges(triangles, len(loop)):
         _recover_edge(points[strip], triangles, a, b, where=where)
     triangles = strip[triangles]
-    directed = np.stack([regular, np.roll(regular, -1, 1)], -1).reshape(-1, 2)
+    # A buried point has lattice triangles all round: no edge of it can lie on a rim.
+    on_rim = np.concatenate([np.ones(len(loop), bool), ~buried])
+    directed = _directed_edges(regular, on_rim)
     rim = directed[~np.isin(_edge_keys(directed), _edge_keys(directed[:, ::-1]))]
     start = points[np.concatenate([np.arange(len(loop)), rim[:, 0]])]
     end = points[np.concatenate([np.roll(np.arange(len(loop)), -1), rim[:, 1]])]
     triangles = triangles[_enclosed(points[triangles].mean(axis=1), start, end)]
     triangles = triangles[_double_area(points, triangles) > 1e-6 * spacing**2]
     triangles = np.concatenate([triangles, regular])
-    _check_filled(points, triangles, loop, where=where)
+    _check_filled(points, triangles, loop, on_rim, where=where)
     return lattice, triangles
 
 
@@ -215,10 +217,17 @@ def _edges_across(points, faces, a: int, b: int) -> list[tuple[int, int]]:
     return [(int(p), int(q)) for p, q in inner if _crosses(points[a], points[b], points[p], points[q])]
 
 
-def _check_filled(points, faces, loop, *, where: str) -> None:
+def _directed_edges(faces: Int[np.ndarray, "F 3"], wanted: Bool[np.ndarray, " P"]) -> Int[np.ndarray, "n 2"]:
+    """The edges of faces, as they run, between wanted points."""
+    start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
+    rows = np.flatnonzero(wanted[start] & wanted[end])
+    return np.stack([start[rows], end[rows]], axis=1)
+
+
+def _check_filled(points, faces, loop, on_rim, *, where: str) -> None:
     """The border of the faces must be exactly the loop, and their area the polygon's."""
     n = len(loop)
-    directed = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), axis=1)
+    directed = np.sort(_directed_edges(faces, on_rim), axis=1)
     keys, count = np.unique(_edge_keys(directed), return_counts=True)
     border = keys[count == 1]
     expected = np.sort(_edge_keys(np.sort(np.stack([np.arange(n), (np.arange(n) + 1) % n], 1), axis=1)))

@@ -79,5 +79,10 @@ def _linear(layer: Any, parts: Sequence[Tensor]) -> Tensor:
     blocks = layer.weight.split([part.shape[-1] for part in parts], dim=1)
     result = nn.functional.linear(parts[-1], blocks[-1], layer.bias)
     for part, block in zip(reversed(parts[:-1]), reversed(blocks[:-1]), strict=True):
-        result = nn.functional.linear(part, block) + result
+        if result.ndim == 1:  # one code for all points: what it adds is a bias
+            result = nn.functional.linear(part, block, result)
+        elif part.ndim == result.ndim == 2 and len(part) == len(result):
+            result = torch.addmm(result, part, block.T)
+        else:
+            result = nn.functional.linear(part, block) + result
     return result
