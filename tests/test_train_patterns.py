@@ -151,6 +151,9 @@ def test_triangles_are_small_copies_of_those_of_the_mesh():
     inside = weights[face, :, np.arange(len(middle))]
     assert inside.min() > -1e-5
     np.testing.assert_allclose(inside.mean(axis=0), 1 / 3, atol=0.02)
+    # A tube of 8 x 8 cells has 128 triangles a panel, of which 56 touch the border.
+    border = np.abs(mesh[..., :2]).max(axis=1) >= np.abs(mesh[..., :2]).max(axis=(0, 1)) - 1e-6
+    assert border.any(axis=1)[face].mean() == pytest.approx(0.4 + 0.6 * 56 / 128, abs=0.03)
     np.testing.assert_allclose(np.einsum("nk,nkc->nc", inside, mesh[face]), middle, atol=1e-5)
     sizes = np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=1) / np.linalg.norm(
         mesh[face, 1] - mesh[face, 0], axis=1

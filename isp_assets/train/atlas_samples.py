@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from isp_assets.conventions import PANELS
+from isp_assets.geometry.topology import edges
 from isp_assets.train.dataset import GarmentDataset, TrainingGarment
 
 
@@ -27,6 +28,7 @@ def seam_indices(garment: TrainingGarment) -> dict[str, Int[np.ndarray, " n"]]:
 
 
 _SMALLEST = 0.2  # of a triangle of the mesh
+_OUTER = 0.4  # share of triangles that touch the panel's border, where two panels must meet without a crease
 
 
 class AtlasSamples:
@@ -39,15 +41,18 @@ class AtlasSamples:
 
     def __init__(self, dataset: GarmentDataset, device: torch.device) -> None:
         self._triangles: dict[str, _Ragged] = {}
+        self._outer_triangles: dict[str, _Ragged] = {}
         seams: list[list[np.ndarray]] = [[] for _ in dataset.garments]
         for side in PANELS:
-            rows = []
+            rows, outer = [], []
             for garment, seam in zip(dataset.garments, seams, strict=True):
                 points = np.concatenate([network_xy(dataset, garment, side), places(garment, side)], axis=1)
                 faces = garment.panels[side].faces
                 rows.append(points[faces].reshape(len(faces), 15))
+                outer.append(rows[-1][np.isin(faces, _border_points(faces)).any(axis=1)])
                 seam.append(points[seam_indices(garment)[side]])
             self._triangles[side] = _Ragged(rows, device)
+            self._outer_triangles[side] = _Ragged(outer, device)
         self._seams = _Ragged([np.concatenate(seam, axis=1) for seam in seams], device)
 
     def triangles(
@@ -58,11 +63,15 @@ class AtlasSamples:
         Each is a smaller copy of a triangle of the mesh somewhere inside it. Corners of the mesh
         alone would leave the network free to ripple between them.
         """
-        whole = self._triangles[side].draw(garment, count, generator).unflatten(-1, (3, 5))
+        outer = int(_OUTER * count)
+        drawn = [
+            self._triangles[side].draw(garment, count - outer, generator),
+            self._outer_triangles[side].draw(garment, outer, generator),
+        ]
+        whole = torch.cat(drawn, dim=1).unflatten(-1, (3, 5))
         shape = whole.shape[:2]
-        weights = (
-            -torch.rand(*shape, 3, 1, generator=generator).clamp_min(1e-6).log()
-        )  # uniform in the triangle
+        # Normalised exponential numbers are uniform in the triangle.
+        weights = -torch.rand(*shape, 3, 1, generator=generator).clamp_min(1e-6).log()
         size = _SMALLEST + (1 - _SMALLEST) * torch.rand(*shape, 1, 1, generator=generator)
         middle = (weights / weights.sum(dim=2, keepdim=True)).to(whole) * whole
         return torch.lerp(middle.sum(dim=2, keepdim=True), whole, size.to(whole))
@@ -73,6 +82,11 @@ class AtlasSamples:
         """The same random seam vertices seen from each panel: network coordinates, then place [m]."""
         front, back = self._seams.draw(garment, count, generator).split(5, dim=-1)
         return dict(zip(PANELS, (front, back), strict=True))
+
+
+def _border_points(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " n"]:
+    mesh = edges(faces)
+    return np.unique(mesh.vertices[mesh.num_faces == 1])
 
 
 class _Ragged:
