@@ -20,7 +20,8 @@ UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0
 UP_AXES = ("y", "z")
 _SAMPLES = 400
 _CLOUDS = 40  # garments that an orientation is tried against
-_PREFERENCE = 0.85  # another orientation must fit this much better than an unturned one
+_PREFERENCE = 0.85  # a less usual unit, turn or place must fit this much better than a usual one
+_USUAL_UNITS = ("m", "cm", "mm")
 
 
 @dataclass(frozen=True)
@@ -89,11 +90,10 @@ def detect_alignment(surface: Surface, clouds: GarmentClouds) -> Alignment:
     found: list[tuple[float, Alignment]] = []
     for candidate in _candidates(points, chosen):
         turned = UNITS[candidate.unit] * points @ candidate.rotation.T
-        weight = 1.0 if candidate.turn == 0 else 1 / _PREFERENCE
         for moved in (False, True):
             score, shift = _best(turned, chosen, moved=moved)
-            penalty = 1 / _PREFERENCE if moved else 1.0
-            found.append((weight * score * penalty, candidate.moved(shift)))
+            unusual = (candidate.turn != 0) + (candidate.unit not in _USUAL_UNITS) + moved
+            found.append((score / _PREFERENCE**unusual, candidate.moved(shift)))
     return min(found, key=lambda row: row[0])[1]
 
 
@@ -107,9 +107,7 @@ def _candidates(points: Float[np.ndarray, "n 3"], clouds: GarmentClouds) -> Iter
             f"the mesh is {size:.3g} units across; in none of {', '.join(UNITS)} does it have the size of a "
             f"garment of this category, {min(sizes):.2f} to {max(sizes):.2f} m; give its unit, or scale it"
         )
-    # Feet and inches lie too close to metres and centimetres to be told from them by size.
-    likely = [name for name in units if name in ("m", "cm", "mm")] or units
-    return (Alignment(unit, up, turn) for unit, up, turn in product(likely, UP_AXES, (0, 90, 180, 270)))
+    return (Alignment(unit, up, turn) for unit, up, turn in product(units, UP_AXES, (0, 90, 180, 270)))
 
 
 def _best(

@@ -93,7 +93,7 @@ def bake_texture(garment: Garment, style: FabricStyle, *, height: int = 1024) ->
     return image
 
 
-def border_loops(panel: Panel) -> list[Int[np.ndarray, " n"]]:
+def border_loops(panel: Panel) -> list[Int[np.ndarray, " _"]]:
     """Closed loops of panel points along the panel's edges, in the direction of its faces."""
     edges = np.concatenate([panel.faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     size = len(panel.panel_xy)
@@ -144,7 +144,7 @@ def _linear(
 
 
 def _masks(
-    window: _Window, loops: list[Int[np.ndarray, " n"]]
+    window: _Window, loops: list[Int[np.ndarray, " _"]]
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Pixels inside the panel, and pixels to fill with cloth (the panel and a rim around it)."""
     shape = np.broadcast_shapes(window.x.shape, window.y.shape)
@@ -159,7 +159,7 @@ def _masks(
     return inside, inside | np.asarray(rim)
 
 
-def _border(garment: Garment, side: str, loops: list[Int[np.ndarray, " n"]], window: _Window) -> _Border:
+def _border(garment: Garment, side: str, loops: list[Int[np.ndarray, " _"]], window: _Window) -> _Border:
     panel, points = garment.panels[side], window.points
     keys = [_edge_keys(i[:-1], i[1:]) for i in (getattr(seam, side) for seam in garment.seams)]
     sewn = np.concatenate([np.empty(0, np.int64), *keys])

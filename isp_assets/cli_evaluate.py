@@ -43,7 +43,7 @@ def reconstruction(
 
     prepare_cpu(1)
     options = ReconstructionOptions(
-        resolutions=tuple(int(r) for r in resolutions.split(",")), garments=garments, finest=finest,
+        resolutions=_numbers(resolutions), garments=garments, finest=finest,
         samples=samples,
     )  # fmt: skip
     whole = ReconstructionTable()
@@ -93,6 +93,13 @@ def decode(
         errors += found.errors
         write_table(out, "decode", rows, meanings=FIGURES, details={"errors": errors})
     _print("decode", rows)
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(f"expected whole numbers, separated by commas; got {text!r}") from error
 
 
 def _bar() -> Any:

@@ -187,8 +187,12 @@ def carry(
     from isp_assets.train.carry import carry_displacement
     from isp_assets.train.fewer_maps import keep_fewer_maps
 
-    carried = carry_displacement(GarmentBundle.load(old), GarmentBundle.load(bundle))
-    if notes := carried.provenance.get("carried"):
+    first = GarmentBundle.load(old)
+    carried = carry_displacement(first, GarmentBundle.load(bundle))
+    if carried.drape_field is first.drape_field:
+        typer.echo("both have the same codes; the displacements are taken as they are")
+    else:
+        notes = carried.provenance["carried"]
         typer.echo(f"{notes['garments']} garments shared; {notes['unexplained']:.1%} of codes unexplained")
     if maps is not None:
         carried, lost = keep_fewer_maps(carried, maps)

@@ -185,7 +185,7 @@ def border_slopes(model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z
 def lift_points(
     model: GarmentModel, sewn: SewnPanels, code: Float[Tensor, " Z"], *,
     border: Mapping[str, BorderSlope] | None = None,
-) -> dict[str, Float[Tensor, "P 3"]]:  # fmt: skip
+) -> dict[str, Float[Tensor, "_ 3"]]:  # fmt: skip
     """Map every panel point to the rest body [m] (Eq. 3); differentiable in the code.
 
     Args:
@@ -207,7 +207,7 @@ def lift_points(
     return lifted
 
 
-def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "P 3"]]) -> Float[Tensor, "V 3"]:
+def weld_points(sewn: SewnPanels, lifted: Mapping[str, Float[Tensor, "_ 3"]]) -> Float[Tensor, "V 3"]:
     """Vertex positions: seam vertices halfway between both panels, their surroundings following smoothly."""
     index = torch.from_numpy(np.concatenate([p.vertex_index for p in sewn.panels.values()]))
     points = torch.cat([lifted[side] for side in sewn.panels])

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from isp_assets.geometry.closest import unit_face_normals
-from isp_assets.geometry.surface_distance import Surface
+from isp_assets.geometry.closest import barycentric_weights, unit_face_normals
+from isp_assets.geometry.surface_distance import Surface, uniform_weights
 from isp_assets.geometry.topology import edges
 
 _MM = 1000.0
@@ -73,8 +73,7 @@ class Distance:
         self.target, self.faces, self.weights = target, faces, weights
         rng = np.random.default_rng(0)
         self._face = rng.choice(len(faces), samples, p=areas / areas.sum())
-        u, v = np.sqrt(rng.random(samples)), rng.random(samples)
-        self._weights = torch.from_numpy(np.stack([1 - u, u * (1 - v), u * v], axis=1)).float()
+        self._weights = torch.from_numpy(uniform_weights(samples, rng)).float()
         mesh = edges(faces)
         self._border = mesh.vertices[mesh.num_faces == 1]
         self._tree = igl.AABB()
@@ -126,19 +125,13 @@ def _closest_on(
 def _weights_of(
     point: Float[np.ndarray, "n 3"], corner: Float[np.ndarray, "n K 3"]
 ) -> Float[np.ndarray, "n K"]:
-    """Barycentric weights of points that lie on their elements."""
-    first = corner[:, 1] - corner[:, 0]
-    offset = point - corner[:, 0]
-    if corner.shape[1] == 2:
-        share = (offset * first).sum(1) / np.maximum((first**2).sum(1), 1e-30)
-        share = share.clip(0, 1)
-        return np.stack([1 - share, share], axis=1)
-    second = corner[:, 2] - corner[:, 0]
-    aa, ab, bb = (first**2).sum(1), (first * second).sum(1), (second**2).sum(1)
-    pa, pb = (offset * first).sum(1), (offset * second).sum(1)
-    area = np.maximum(aa * bb - ab * ab, 1e-30)
-    u, v = ((bb * pa - ab * pb) / area).clip(0, 1), ((aa * pb - ab * pa) / area).clip(0, 1)
-    return np.stack([1 - u - v, u, v], axis=1)
+    """Barycentric weights of points that lie on their triangles or segments."""
+    if corner.shape[1] == 3:
+        return barycentric_weights(point, corner)
+    along = corner[:, 1] - corner[:, 0]
+    share = ((point - corner[:, 0]) * along).sum(1) / np.maximum((along**2).sum(1), 1e-30)
+    share = share.clip(0, 1)
+    return np.stack([1 - share, share], axis=1)
 
 
 def _on_segments(

@@ -11,7 +11,7 @@ from analytic_panels import SKIRT, SKIRT_SEAMS, polygon_model
 from training_sets import tube_dataset
 
 from isp_assets.bundle import GarmentBundle
-from isp_assets.errors import DatasetError, GeometryError, PluginError
+from isp_assets.errors import BundleError, DatasetError, GeometryError, InputError, PluginError
 from isp_assets.evaluate.memory import PeakMemory
 from isp_assets.evaluate.reconstruction import (
     FIGURES,
@@ -126,6 +126,12 @@ def test_tables_come_back(data, tmp_path):
     assert "`nc_percent`" in text
 
 
+@pytest.mark.parametrize("wrong", [{"resolutions": ()}, {"garments": 0}, {"samples": 0}])
+def test_nothing_to_measure_is_refused(wrong):
+    with pytest.raises(InputError, match="expected at least one"):
+        ReconstructionOptions(**wrong)
+
+
 def test_the_papers_figures_are_those_of_its_table():
     found = {(r["method"][:3], r["split"], r["resolution"]): r["chd_1e4"] for r in PAPER_SHIRTS}
     assert found["ISP", "train", 512] == 0.250
@@ -201,6 +207,13 @@ class TestRobustness:
         first, second = (evaluate_robustness(bundle, self.options).rows for _ in range(2))
         for one, other in zip(first, second, strict=True):
             assert {**one, "seconds": 0} == {**other, "seconds": 0}
+
+    def test_wrong_options_and_bundles_are_refused(self, bundle):
+        with pytest.raises(InputError, match="2 mixtures or more"):
+            RobustnessOptions(steps=1)
+        one = replace(bundle, codes=dict(list(bundle.codes.items())[:1]))
+        with pytest.raises(BundleError, match="mixing takes two"):
+            evaluate_robustness(one, self.options)
 
     def test_odd_parameters_go_beyond_their_range_one_by_one(self, bundle):
         """Here the code's first number is the parameter, so pushing it by half its range is exact."""

@@ -57,7 +57,7 @@ def test_a_fit_is_no_worse_than_its_best_start(bundle):
     assert found.distance.mean < 0.5 * min(starts)
 
 
-@pytest.mark.parametrize("how", ["cm,y", "mm,z", "m,z"])
+@pytest.mark.parametrize("how", ["cm,y", "mm,z", "inch,y"])
 def test_units_and_axes_are_found(bundle, how):
     given = Alignment.parse(how)
     here = surface(bundle, [0.035, 0.02])

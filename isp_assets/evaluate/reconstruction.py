@@ -19,7 +19,7 @@ from jaxtyping import Float
 from isp_assets.alignment import Alignment
 from isp_assets.bundle import GarmentBundle
 from isp_assets.decode import decode_with_report
-from isp_assets.errors import DatasetError, GeometryError, IspAssetsError, PluginError
+from isp_assets.errors import DatasetError, GeometryError, InputError, IspAssetsError, PluginError
 from isp_assets.evaluate.memory import PeakMemory
 from isp_assets.fit import Fitter
 from isp_assets.fit_search import FitOptions
@@ -122,6 +122,13 @@ class ReconstructionOptions:
     samples: int = 100_000
     """Points on each surface."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.resolutions or min(*self.resolutions, self.garments, self.finest, self.samples) < 1:
+            raise InputError(
+                "evaluation: expected at least one resolution, garment, garment at the finest resolution "
+                f"and sample; got {self}"
+            )
 
 
 @dataclass

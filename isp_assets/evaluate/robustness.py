@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from isp_assets.bundle import GarmentBundle
 from isp_assets.decode import decode_with_report
-from isp_assets.errors import DecodeError
+from isp_assets.errors import BundleError, DecodeError, InputError
 from isp_assets.fit_search import CodeSpace
 from isp_assets.garment import Garment
 from isp_assets.geometry.folds import folded_faces
@@ -62,6 +62,12 @@ class RobustnessOptions:
     """Garments decoded at every resolution."""
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if min(self.pairs, self.random, self.odd, self.garments) < 0 or self.steps < 2:
+            raise InputError(
+                f"evaluation: counts must be 0 or more, and a pair has 2 mixtures or more; got {self}"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class RobustnessReport:
@@ -91,7 +97,12 @@ def evaluate_robustness(
         options: How much to test.
         data: The training garments, for codes of odd parameters; left out without it.
         progress: Called with (finished, total, test).
+
+    Raises:
+        BundleError: If the bundle holds fewer than two garments.
     """
+    if len(bundle.codes) < 2:
+        raise BundleError(f"bundle {bundle.category!r} has {len(bundle.codes)} garments; mixing takes two")
     options = options or RobustnessOptions()
     cases = list(_cases(bundle, options, data))
     usual = _usual_openings(bundle, options.resolution)

@@ -154,7 +154,7 @@ class ClosestQuery:
         face, closest = face.reshape(-1).astype(np.int64), closest.reshape(-1, 3)  # igl gives C's long long
         if self._subset is not None:
             face = self._subset[face]
-        weights = _barycentric(closest, self.vertices[self.topology.faces[face]])
+        weights = barycentric_weights(closest, self.vertices[self.topology.faces[face]])
         normal, on_border = self._pseudonormals(face, weights)
         side = np.where(np.einsum("pc,pc->p", points - closest, normal) < 0, -1.0, 1.0)
         return Closest(closest, face, weights, normal, side * np.sqrt(squared), on_border)
@@ -205,9 +205,10 @@ def signed_heights(
     return heights
 
 
-def _barycentric(
+def barycentric_weights(
     point: Float[np.ndarray, "P 3"], corner: Float[np.ndarray, "P 3 3"]
 ) -> Float[np.ndarray, "P 3"]:
+    """Weights of the corners of triangles that give points in them; each in 0..1."""
     a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     p = point - corner[:, 0]
     aa, ab, bb, pa, pb = (np.einsum("pc,pc->p", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))

@@ -49,9 +49,7 @@ class Surface:
         if not area.sum() > 0:
             raise GeometryError("surface has no area; nothing can be sampled on it")
         face = rng.choice(len(area), count, p=area / area.sum())
-        u, v = np.sqrt(rng.random(count)), rng.random(count)
-        weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
-        return np.einsum("nk,nkc->nc", weights, corner[face]), face
+        return np.einsum("nk,nkc->nc", uniform_weights(count, rng), corner[face]), face
 
 
 @dataclass(frozen=True)
@@ -110,6 +108,12 @@ def surface_distance(
         normal_consistency=float(np.abs(cosines).mean()),
         signed_normal_consistency=float(cosines.mean()),
     )
+
+
+def uniform_weights(count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Barycentric weights of points uniform in a triangle."""
+    u, v = np.sqrt(rng.random(count)), rng.random(count)
+    return np.stack([1 - u, u * (1 - v), u * v], axis=1)
 
 
 def distance_to_surface(points: Float[np.ndarray, "n 3"], surface: Surface) -> Float[np.ndarray, " n"]:

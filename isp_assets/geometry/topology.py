@@ -72,7 +72,7 @@ def hinges(faces: Int[np.ndarray, "F 3"]) -> Hinges:
     )
 
 
-def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[Int[np.ndarray, " n"]]:
+def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[Int[np.ndarray, " _"]]:
     """Trace the border of an oriented mesh.
 
     Returns:

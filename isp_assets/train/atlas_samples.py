@@ -92,7 +92,7 @@ def _border_points(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " n"]:
 class _Ragged:
     """Rows of several garments in one tensor; garments may have different numbers of rows."""
 
-    def __init__(self, rows: list[Float[np.ndarray, "n D"]], device: torch.device) -> None:
+    def __init__(self, rows: list[Float[np.ndarray, "_ D"]], device: torch.device) -> None:
         self._rows = torch.from_numpy(np.concatenate(rows).astype(np.float32)).to(device)
         self._counts = torch.tensor([len(r) for r in rows])
         self._starts = self._counts.cumsum(0) - self._counts

@@ -192,10 +192,10 @@ def mirrored(curve: Curve) -> Curve:
 
 def _resample_loops(
     loops: tuple[Loop, ...], spacing: float
-) -> tuple[list[Curve], dict[int, Int[np.ndarray, " n"]]]:
+) -> tuple[list[Curve], dict[int, Int[np.ndarray, " _"]]]:
     """Loop points, and per label the panel point numbers of its edges, end points included."""
     result: list[Curve] = []
-    index: dict[int, list[Int[np.ndarray, " n"]]] = {}
+    index: dict[int, list[Int[np.ndarray, " _"]]] = {}
     start = 0
     for loop in loops:
         curves = [resample(edge.points, spacing) for edge in loop]
