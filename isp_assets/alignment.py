@@ -80,9 +80,14 @@ def detect_alignment(surface: Surface, clouds: GarmentClouds) -> Alignment:
     so that its centre is that of the most similar garment.
 
     Raises:
-        MeshError: If in no unit the surface has the size of a garment.
+        MeshError: If in no unit the surface has the size of a garment, or no cloud has points.
     """
     usable = [cloud for cloud in clouds.points if len(cloud) > 10]
+    if not usable:
+        raise MeshError(
+            "no garment to compare with has a shape, so nothing can be detected; give the alignment, "
+            "or train the bundle"
+        )
     chosen = GarmentClouds(
         tuple(usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, _CLOUDS).astype(int)))
     )

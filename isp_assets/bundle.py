@@ -52,6 +52,8 @@ class GarmentBundle:
     """How the networks were trained; plain JSON values."""
     metrics: Mapping[str, Any] = field(default_factory=dict)
     """How well they do on their training garments; plain JSON values."""
+    precision: Precision = "float16"
+    """That of the stored weights."""
 
     def __post_init__(self) -> None:
         for name, code in self.codes.items():
@@ -120,8 +122,12 @@ class GarmentBundle:
         code = self.code(name) if isinstance(garment, str) else garment
         return decode_garment(self.model, code, resolution=resolution, name=name)
 
-    def save(self, path: str | os.PathLike, *, dtype: Precision = "float16") -> None:
+    def save(self, path: str | os.PathLike, *, dtype: Precision | None = None) -> None:
         """Write the bundle as one safetensors file, atomically.
+
+        Args:
+            path: The file.
+            dtype: Precision of the weights; the bundle's own if left out.
 
         Raises:
             BundleError: If provenance or metrics hold what JSON cannot keep.
@@ -131,7 +137,7 @@ class GarmentBundle:
         networks |= {f"atlas.{side}": model.atlases[side] for side in PANELS}
         if self.drape_field is not None:
             networks["drape_field"] = self.drape_field
-        tensors = _pack(networks, dtype)
+        tensors = _pack(networks, dtype or self.precision)
         codes = np.stack(list(self.codes.values())) if self.codes else np.zeros((0, model.code_size))
         tensors["codes"] = torch.from_numpy(codes.astype(np.float32))
         tensors["rest_pose"] = torch.from_numpy(np.array(model.rest_pose))
@@ -174,10 +180,12 @@ class GarmentBundle:
                 anchor_labels=tuple(manifest["anchor_labels"]), rest_pose=tensors["rest_pose"].numpy(),
                 panel_center=tensors["panel_center"].numpy(), panel_scale=manifest["panel_scale"],
             )  # fmt: skip
+            weight = tensors["panel_field.front.shared.layers.0.weight"]
+            precision: Precision = "float16" if weight.dtype == torch.float16 else "float32"
             codes = dict(zip(manifest["garments"], tensors["codes"].numpy(), strict=True))
             return cls(
                 model, codes, manifest["body_sha256"], manifest["body_name"], drape,
-                manifest["provenance"], manifest["metrics"],
+                manifest["provenance"], manifest["metrics"], precision,
             )  # fmt: skip
 
 

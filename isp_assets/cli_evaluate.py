@@ -28,9 +28,9 @@ def reconstruction(
 ) -> None:
     """Rest shapes against the true garments: distances, normals, seams, time and memory (Table 1)."""
     from isp_assets.bundle import GarmentBundle
+    from isp_assets.evaluate.paper import PAPER_SHIRTS
     from isp_assets.evaluate.reconstruction import (
         FIGURES,
-        PAPER_SHIRTS,
         IspReconstructor,
         ReconstructionOptions,
         ReconstructionTable,

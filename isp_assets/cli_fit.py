@@ -17,7 +17,9 @@ def fit() -> None:
 def mesh(
     target: Annotated[Path, typer.Argument(help="Mesh in rest pose: OBJ, PLY, STL, GLB, OFF, VTK or VTU.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Code file to write (.safetensors).")],
-    collection: Annotated[str, typer.Option(help="Collection whose networks are used.")] = "default",
+    collection: Annotated[
+        str, typer.Option(help="Collection whose networks are used, unless --add-to exists.")
+    ] = "default",
     category: Annotated[
         str | None, typer.Option(help="top, skirt or trousers; found by likeness if left out.")
     ] = None,
@@ -40,14 +42,20 @@ def mesh(
     from isp_assets.alignment import Alignment
     from isp_assets.collection import Collection
     from isp_assets.fit import Fitter, choose_bundle
-    from isp_assets.mesh_file import read_surface, write_surface
+    from isp_assets.mesh_file import check_writable, read_surface, write_surface
     from isp_assets.train.cpu import prepare_cpu
 
     prepare_cpu(1)
-    surface = read_surface(target)
+    garment_name = name or target.stem
     loaded = Collection.load(collection)
     given = None if align == "auto" else Alignment.parse(align)
-    bundle = choose_bundle(loaded, surface, category=category, alignment=given)
+    wardrobe = Collection.load(add_to) if add_to is not None and add_to.exists() else None
+    if preview is not None:
+        check_writable(preview)
+    if add_to is not None:  # what cannot be added is refused before the work, not after it
+        (wardrobe or loaded).check_new_name(garment_name)
+    surface = read_surface(target)
+    bundle = choose_bundle(wardrobe or loaded, surface, category=category, alignment=given)
     columns = (TextColumn("fitting"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("starting", total=1.0)
@@ -57,12 +65,11 @@ def mesh(
             alignment=given,
             progress=lambda share, text: bar.update(task, completed=share, description=text),
         )
-    code = found.as_code(bundle, name or target.stem)
+    for line in found.summary(bundle.category):
+        typer.echo(line)
+    code = found.as_code(bundle, garment_name)
     code.save(output)
     if preview is not None:
         write_surface(preview, found.surface)
     if add_to is not None:
-        folder = Collection.load(add_to) if add_to.exists() else loaded.copy_to(add_to)
-        folder.add(code)
-    for line in found.summary(bundle.category):
-        typer.echo(line)
+        (wardrobe or loaded.copy_to(add_to)).add(code)

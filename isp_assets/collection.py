@@ -25,6 +25,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.code_file import GarmentCode
 from isp_assets.errors import BundleError, CollectionError, InputError
@@ -89,6 +91,8 @@ class Collection:
             table.get("layering", table["skin"]),
             *(e.bundle for e in entries.values()),
         }:
+            if Path(file).name != file:
+                raise CollectionError(f"{path}: names the file {file!r}; expected one in the folder itself")
             if not (folder / file).is_file():
                 raise CollectionError(f"{path}: names the file {file!r}, which is not in {folder}")
         return cls(folder, table["name"], table["body_sha256"], entries, table["skin"], table.get("layering"))
@@ -167,7 +171,7 @@ class Collection:
 
         Returns:
             The collection as it is now. Both files are replaced whole; should the second fail,
-            the bundle holds a code that no entry names, which harms nothing.
+            the bundle holds a code that no entry names, and adding the garment again completes it.
 
         Raises:
             CollectionError: If the collection is the built-in one, has no bundle of the category,
@@ -176,24 +180,18 @@ class Collection:
         """
         path = self.folder / FILE_NAME
         if self.folder.resolve() == DEFAULT_FOLDER.resolve():
-            raise CollectionError(
-                "the built-in collection is not changed; copy it to a folder, and add there"
-            )
-        if garment.name in self.entries:
-            raise CollectionError(f"{path}: has a garment {garment.name!r} already; choose another name")
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", garment.name):
-            raise CollectionError(
-                f"{path}: a garment's name is made of letters, digits, _ and -, got {garment.name!r}"
-            )
-        found = [file for file in self.bundle_files() if self.bundle(file).category == garment.category]
-        if not found:
+            raise CollectionError("the built-in collection is not changed; copy it, and add to the copy")
+        self.check_new_name(garment.name)
+        files = [file for file in self.bundle_files() if self.bundle(file).category == garment.category]
+        if not files:
             raise CollectionError(f"{path}: no bundle of category {garment.category!r} to add the garment to")
-        bundle = self.bundle(found[0])
-        if bundle.model_sha256 != garment.model_sha256:
+        found = [file for file in files if self.bundle(file).model_sha256 == garment.model_sha256]
+        if not found:
             raise BundleError(
-                f"{self.folder / found[0]}: the code of {garment.name!r} was found with other networks; "
+                f"{self.folder / files[0]}: the code of {garment.name!r} was found with other networks; "
                 "fit it with this collection"
             )
+        bundle = self.bundle(found[0])
         FabricStyle.from_text(color=color, kind=fabric)
         lines = [f"[garments.{garment.name}]", f'bundle = "{found[0]}"', f'color = "{color}"']
         text = (
@@ -201,9 +199,24 @@ class Collection:
             + "\n\n"
             + "\n".join([*lines, f'fabric = "{fabric}"', ""])
         )
-        bundle.with_code(garment.name, garment.code).save(self.folder / found[0])
+        if not np.array_equal(bundle.codes.get(garment.name, np.empty(0)), garment.code):
+            bundle.with_code(garment.name, garment.code).save(self.folder / found[0])
         write_text(path, text)
         return Collection.load(self.folder)
+
+    def check_new_name(self, name: str) -> None:
+        """Whether a further garment may have a name.
+
+        Raises:
+            CollectionError: If the name is taken, or holds anything but letters, digits, _ and -.
+        """
+        path = self.folder / FILE_NAME
+        if name in self.entries:
+            raise CollectionError(f"{path}: has a garment {name!r} already; choose another name")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+            raise CollectionError(
+                f"{path}: a garment's name is made of letters, digits, _ and -, got {name!r}; choose another"
+            )
 
     def copy_to(self, folder: str | Path) -> "Collection":
         """Copy the collection's files into a new folder.
@@ -220,7 +233,6 @@ class Collection:
         try:
             files = {FILE_NAME, self.skin_file, *self.bundle_files()}
             for file in files | ({self.layering_file} if self.layering_file else set()):
-                (partial / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self.folder / file, partial / file)
             partial.rename(folder)
         except BaseException:

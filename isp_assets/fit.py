@@ -21,6 +21,7 @@ from isp_assets.alignment import Alignment, detect_alignment
 from isp_assets.bundle import GarmentBundle
 from isp_assets.code_file import GarmentCode
 from isp_assets.collection import Collection
+from isp_assets.decode import RESOLUTIONS
 from isp_assets.errors import DecodeError, GeometryError, MeshError
 from isp_assets.fit_objective import Target
 from isp_assets.fit_search import CodeSpace, FitOptions, Search, SearchState
@@ -79,30 +80,33 @@ def choose_bundle(
     category: str | None = None,
     alignment: Alignment | None = None,
 ) -> GarmentBundle:
-    """The bundle of a category, or the one that holds the garment most like a surface.
+    """The bundle that holds the garment most like a surface, of one category if it is given.
 
     Raises:
         MeshError: If the collection has no such category, or the surface the size of no garment.
     """
-    bundles = {b.category: b for b in map(collection.bundle, collection.bundle_files())}
+    bundles = {file: collection.bundle(file) for file in collection.bundle_files()}
+    known = dict.fromkeys(bundle.category for bundle in bundles.values())
     if category is not None:
-        if category not in bundles:
-            raise MeshError(
-                f"collection {collection.name!r} has no category {category!r}; it has {', '.join(bundles)}"
-            )
-        return bundles[category]
+        bundles = {file: bundle for file, bundle in bundles.items() if bundle.category == category}
+    if not bundles:
+        raise MeshError(
+            f"collection {collection.name!r} has no category {category!r}; it has {', '.join(known)}"
+        )
+    if len(bundles) == 1:
+        return next(iter(bundles.values()))
     scores: dict[str, float] = {}
-    for name, bundle in bundles.items():
+    for file, bundle in bundles.items():
         fitter = Fitter(bundle)
         try:
             place = alignment or detect_alignment(surface, fitter.clouds)
         except MeshError:
             continue
         points, _ = place.apply(surface).sample(_CHOICE_SAMPLES, np.random.default_rng(0))
-        scores[name] = float(fitter.clouds.distances(points).min())
+        scores[file] = float(fitter.clouds.distances(points).min())
     if not scores:
         raise MeshError(
-            f"in no unit has the mesh the size of a garment ({', '.join(bundles)}); give --align, or scale it"
+            f"in no unit has the mesh the size of a garment ({', '.join(known)}); give --align, or scale it"
         )
     return bundles[min(scores, key=scores.__getitem__)]
 
@@ -147,7 +151,7 @@ class Fitter:
 
         Raises:
             MeshError: If the surface has not the size of a garment in any unit.
-            DecodeError: If no start decodes.
+            DecodeError: If no start decodes, or the code found decodes at its own resolution alone.
         """
         began, options = time.perf_counter(), self.options
         place = alignment or detect_alignment(surface, self.clouds)
@@ -164,7 +168,7 @@ class Fitter:
             if stalled:
                 break
         code = self._space.code(state.position).astype(np.float32)
-        garment = self.bundle.decode(code, resolution=2 * options.resolution)
+        garment = self.bundle.decode(code, resolution=min(2 * options.resolution, RESOLUTIONS[1]))
         made = Surface(garment.rest_vertices, garment.faces)
         place = place.moved(-state.shift)
         distance = surface_distance(made, place.apply(surface), samples=20_000)

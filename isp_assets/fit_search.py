@@ -16,8 +16,8 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 from torch import Tensor
 
-from isp_assets.decode import SLIVER, border_slopes, cut_panels, lift_points, weld_points
-from isp_assets.errors import DecodeError, GeometryError
+from isp_assets.decode import RESOLUTIONS, SLIVER, border_slopes, cut_panels, lift_points, weld_points
+from isp_assets.errors import DecodeError, GeometryError, InputError
 from isp_assets.fit_objective import Distance, FitWeights, Target
 from isp_assets.garment_model import GarmentModel
 from isp_assets.geometry.sewing import SewnPanels, sew_panels
@@ -47,6 +47,14 @@ class FitOptions:
     samples: int = 3000
     """Points on the target, and on the garment."""
     weights: FitWeights = field(default_factory=FitWeights)
+
+    def __post_init__(self) -> None:
+        low, high = RESOLUTIONS
+        if not low <= self.resolution <= high or self.samples < 100 or self.neighbours < 0:
+            raise InputError(
+                f"fit: expected a resolution in {low}..{high} cells, 100 samples or more and no fewer than 0 "
+                f"neighbours; got {self}"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from isp_assets.geometry.surface_distance import Surface
 
 _TRIMESH = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 _MESHIO = (".vtk", ".vtu")
+_WRITTEN = (".glb", ".obj", ".off", ".ply", ".stl")  # each in one file
 SUFFIXES = (*_TRIMESH, *_MESHIO)
 
 
@@ -50,11 +51,20 @@ def write_surface(path: Path, surface: Surface) -> None:
 
     from isp_assets.files import published
 
-    if path.suffix.lower() not in _TRIMESH:
-        raise MeshError(f"{path}: meshes are written to {', '.join(_TRIMESH)} files, got {path.suffix!r}")
+    check_writable(path)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     with published(path) as temporary:
         mesh.export(temporary)
+
+
+def check_writable(path: Path) -> None:
+    """Whether `write_surface` knows the kind of a file.
+
+    Raises:
+        MeshError: If it does not.
+    """
+    if path.suffix.lower() not in _WRITTEN:
+        raise MeshError(f"{path}: meshes are written to {', '.join(_WRITTEN)} files, got {path.suffix!r}")
 
 
 def _by_trimesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -74,13 +84,16 @@ def _by_meshio(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     # Its general reader leaves the process when a file is damaged; those of single formats raise.
     mesh = {".vtk": meshio.vtk, ".vtu": meshio.vtu}[path.suffix.lower()].read(path)
-    faces = [cells.data for cells in mesh.cells if cells.type == "triangle"]
-    for cells in mesh.cells:
-        if cells.type == "quad":
-            faces += [cells.data[:, [0, 1, 2]], cells.data[:, [0, 2, 3]]]
-    if not faces:
-        kinds = sorted({cells.type for cells in mesh.cells})
-        raise GeometryError(f"the file holds no triangles or quads, but {kinds}")
+    kinds = {cells.type for cells in mesh.cells}
+    if unknown := kinds - {"triangle", "quad", "polygon", "line", "vertex"}:
+        raise GeometryError(
+            f"the file holds cells of kind {sorted(unknown)}, not triangles and polygons only"
+        )
+    polygons = [np.asarray(cells.data) for cells in mesh.cells if cells.type not in ("line", "vertex")]
+    if not polygons:
+        raise GeometryError(f"the file holds no triangles, but {sorted(kinds)}")
+    # A fan about the first corner, as every reader cuts polygons that carry no better advice.
+    faces = [data[:, [0, k, k + 1]] for data in polygons for k in range(1, data.shape[1] - 1)]
     return mesh.points[:, :3], np.concatenate(faces)
 
 

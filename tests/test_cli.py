@@ -65,6 +65,12 @@ def test_a_mesh_is_fitted_and_added(tmp_path: Path) -> None:
     assert mine.names()[-1] == "found"
     assert (mine.item("found").code == code.code).all()
     assert len(read_surface(tmp_path / "preview.ply").faces) > 100
+    taken = run(
+        "fit", "mesh", tmp_path / "found.obj", "-o", tmp_path / "x.safetensors", "--add-to", tmp_path / "mine"
+    )
+    assert taken.returncode == 3
+    assert "has a garment 'found' already" in taken.stderr
+    assert not (tmp_path / "x.safetensors").exists(), "refused before the work"
     again = run("fit", "mesh", tmp_path / "found.obj", "-o", tmp_path / "x.safetensors", "--align", "furlong")
     assert again.returncode == 3
     assert "not an alignment" in again.stderr or "unit must be" in again.stderr

@@ -162,6 +162,48 @@ def test_what_cannot_be_added_changes_nothing(copy: Path, change, error, message
     assert {p.name: p.read_bytes() for p in copy.iterdir()} == files
 
 
+def test_adding_again_completes_what_was_cut_off(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collection = Collection.load(copy)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "isp_assets.collection.write_text", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+        )
+        with pytest.raises(OSError, match="disk full"):
+            collection.add(garment_code(collection, "half_skirt"))
+    half = Collection.load(copy)
+    assert "half_skirt" not in half.names()
+    assert "half_skirt" in half.add(garment_code(half, "half_skirt")).names()
+
+
+def test_adding_keeps_the_precision_of_the_bundle(copy: Path) -> None:
+    bundle = GarmentBundle.load(copy / "skirt.safetensors")
+    bundle.save(copy / "skirt.safetensors", dtype="float32")
+    collection = Collection.load(copy)
+    now = collection.add(garment_code(collection, "half_skirt"))
+    assert now.bundle("skirt.safetensors").precision == "float32"
+    assert bundle.precision == "float16"
+
+
+def test_of_several_bundles_of_a_category_the_codes_own_is_chosen(copy: Path) -> None:
+    """A second bundle of skirts, with other networks, listed before the first."""
+    other = GarmentBundle.load(copy / "skirt.safetensors")
+    for parameter in other.model.atlases["front"].parameters():
+        parameter.data.add_(0.01)
+    replace(other).save(copy / "more.safetensors")
+    edit(copy, "[garments.tank_top]", '[garments.other]\nbundle = "more.safetensors"\ncode = "pencil_skirt"\n'
+         'color = "#000000"\n\n[garments.tank_top]')  # fmt: skip
+    collection = Collection.load(copy)
+    now = collection.add(garment_code(collection, "half_skirt"))
+    assert now.entry("half_skirt").bundle == "skirt.safetensors"
+
+
+def test_files_outside_the_folder_are_refused(copy: Path) -> None:
+    shutil.copyfile(copy / "skin.safetensors", copy.parent / "skin.safetensors")
+    edit(copy, 'skin = "skin.safetensors"', 'skin = "../skin.safetensors"')
+    with pytest.raises(CollectionError, match="expected one in the folder itself"):
+        Collection.load(copy)
+
+
 def test_the_built_in_collection_is_not_changed(collection: Collection) -> None:
     with pytest.raises(CollectionError, match="built-in collection is not changed"):
         collection.add(garment_code(collection, "half_skirt"))

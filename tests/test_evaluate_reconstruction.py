@@ -13,9 +13,9 @@ from training_sets import tube_dataset
 
 from isp_assets.bundle import GarmentBundle
 from isp_assets.errors import BundleError, DatasetError, GeometryError, InputError, PluginError
+from isp_assets.evaluate.paper import PAPER_SHIRTS
 from isp_assets.evaluate.reconstruction import (
     FIGURES,
-    PAPER_SHIRTS,
     Decoded,
     IspReconstructor,
     ReconstructionOptions,
@@ -124,6 +124,15 @@ def test_tables_come_back(data, tmp_path):
     assert "(quoted)" in text
     assert text.count("\n| ") == len(rows)
     assert "`nc_percent`" in text
+
+
+def test_the_finest_resolution_is_measured_for_as_many_as_asked():
+    options = ReconstructionOptions(resolutions=(128, 256), finest=6)
+    assert sum(256 in options.resolutions_of(k, 20) for k in range(20)) == 6
+    assert options.resolutions_of(0, 20) == (128, 256)
+    assert all(256 in options.resolutions_of(k, 4) for k in range(4)), "all, if there are fewer"
+    one = ReconstructionOptions(resolutions=(256,), finest=1)
+    assert all(one.resolutions_of(k, 20) == (256,) for k in range(20))
 
 
 @pytest.mark.parametrize("wrong", [{"resolutions": ()}, {"garments": 0}, {"samples": 0}])

@@ -31,8 +31,15 @@ def test_what_is_written_comes_back(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", ["vtk", "vtu"])
 def test_formats_of_simulation_programs(tmp_path, suffix):
     path = tmp_path / f"mesh.{suffix}"
-    meshio.Mesh(VERTICES, [("triangle", FACES[:2]), ("quad", np.array([[1, 4, 5, 2]]))]).write(path)
+    cells = [("triangle", FACES[:2]), ("quad", np.array([[1, 4, 5, 2]])), ("line", np.array([[0, 1]]))]
+    meshio.Mesh(VERTICES, cells).write(path)
     same(read_surface(path))
+
+
+def test_volumes_are_no_garments(tmp_path):
+    meshio.Mesh(VERTICES, [("tetra", np.array([[0, 1, 2, 4]]))]).write(tmp_path / "solid.vtu")
+    with pytest.raises(MeshError, match="cells of kind"):
+        read_surface(tmp_path / "solid.vtu")
 
 
 def test_cuts_of_the_texture_are_closed(tmp_path):
@@ -73,7 +80,7 @@ def test_damaged_files_are_named(tmp_path, suffix, content):
 
 def test_files_without_faces_are_named(tmp_path):
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    with pytest.raises(MeshError, match="points"):
+    with pytest.raises(MeshError, match=r"no mesh|no faces|no triangles"):
         read_surface(tmp_path / "points.obj")
     meshio.Mesh(VERTICES, [("line", np.array([[0, 1]]))]).write(tmp_path / "lines.vtk")
     with pytest.raises(MeshError, match="no triangles"):

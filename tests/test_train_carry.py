@@ -148,3 +148,4 @@ def test_usual_poses_decide_what_is_kept():
     fewer, lost = keep_fewer_maps(bundle(codes, drape_field=random_field()), 5)
     assert fewer.drape_field.config.basis == 5
     assert 0 <= lost < 0.2
+    assert fewer.provenance["fewer_maps"] == {"kept": 5, "lost": lost}

@@ -28,22 +28,6 @@ from isp_assets.train.dataset import GarmentDataset, TrainingGarment
 
 Code = Float[np.ndarray, " Z"]
 
-_TABLE_1 = (
-    ("ISP", "train", (128, 0.454, 99.20, 0.025), (256, 0.290, 99.37, 0.077), (512, 0.250, 99.41, 0.261)),
-    ("ISP", "test", (128, 0.579, 98.70, None), (256, 0.392, 98.83, None), (512, 0.349, 98.89, None)),
-    ("UDF", "train", (128, 0.641, 98.86, 0.601), (256, 0.338, 99.20, 2.379), (512, 0.262, 98.77, 13.258)),
-    ("UDF", "test", (128, 0.803, 97.71, None), (256, 0.493, 98.44, None), (512, 0.424, 98.09, None)),
-)  # fmt: skip
-PAPER_SHIRTS: tuple[dict[str, Any], ...] = tuple(
-    {
-        "method": f"{method} of the paper (quoted)", "category": "shirt", "split": split,
-        "resolution": resolution, "chd_1e4": chd, "nc_percent": nc, "warm_s": seconds,
-    }
-    for method, split, *rows in _TABLE_1
-    for resolution, chd, nc, seconds in rows
-)  # fmt: skip
-"""Table 1 of the paper, on its own data and on a V100: quoted, not measured here."""
-
 FIGURES: dict[str, str] = {
     "garments": "garments measured",
     "failures": "garments that could not be fitted or decoded",
@@ -55,7 +39,7 @@ FIGURES: dict[str, str] = {
     "nc_percent": "normal consistency, |cosine| at nearest samples [%]",
     "nc_signed_percent": "the same with its sign [%]",
     "seam_mm": "mean gap of the seams before sewing [mm]",
-    "cold_s": "first decode of the process at this resolution [s]",
+    "cold_s": "the first decode of the row [s]",
     "warm_s": "median of the others [s]",
     "peak_mib": "memory that a decode takes on top, at its peak [MiB]",
     "fit_s": "median time of a fit [s]",
@@ -130,6 +114,13 @@ class ReconstructionOptions:
                 f"and sample; got {self}"
             )
 
+    def resolutions_of(self, index: int, count: int) -> tuple[int, ...]:
+        """Those measured for a garment; of several, the finest only for some garments, evenly drawn."""
+        chosen = np.unique(np.linspace(0, count - 1, min(self.finest, count)).astype(int))
+        if len(self.resolutions) == 1 or index in chosen:
+            return self.resolutions
+        return tuple(r for r in self.resolutions if r != max(self.resolutions))
+
 
 @dataclass
 class ReconstructionTable:
@@ -157,19 +148,20 @@ def evaluate_reconstruction(
         progress: Called with (finished, total, text) after every garment.
 
     Raises:
-        DatasetError: If a method knows none of the training garments.
+        DatasetError: If a method has no code for one of the training garments chosen.
     """
     options = options or ReconstructionOptions()
     table = ReconstructionTable()
     unit = half_diagonal(data["train"])
     chosen = {split: _chosen(dataset, options.garments) for split, dataset in data.items()}
+    _check_codes(methods, chosen["train"])
     total, done = len(methods) * sum(map(len, chosen.values())), 0
     for method in methods:
         for split, garments in chosen.items():
             measured: list[dict[str, Any]] = []
             for index, garment in enumerate(garments):
-                finest = index % max(1, len(garments) // options.finest) == 0
-                measured += _measure(method, garment, split, options, unit=unit, finest=finest)
+                resolutions = options.resolutions_of(index, len(garments))
+                measured += _measure(method, garment, split, resolutions, options, unit)
                 done += 1
                 progress(done, total, f"{method.name}, {split}: {garment.name}")
             table.garments += measured
@@ -215,9 +207,18 @@ def _chosen(dataset: GarmentDataset, count: int) -> list[TrainingGarment]:
     return [dataset.garments[k] for k in index]
 
 
+def _check_codes(methods: Sequence[Reconstructor], garments: Sequence[TrainingGarment]) -> None:
+    for method in methods:
+        if missing := [g.name for g in garments if g.name not in method.codes]:
+            raise DatasetError(
+                f"{method.name} has no code for the training garment {missing[0]!r} and {len(missing) - 1} "
+                "others; was it trained on this data set?"
+            )
+
+
 def _measure(
-    method: Reconstructor, garment: TrainingGarment, split: str, options: ReconstructionOptions, *,
-    unit: float, finest: bool,
+    method: Reconstructor, garment: TrainingGarment, split: str, resolutions: Sequence[int],
+    options: ReconstructionOptions, unit: float,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Figures of one garment at every resolution."""
     truth = garment_surface(garment)
@@ -230,22 +231,15 @@ def _measure(
     try:
         began = time.perf_counter()
         if split == "train":
-            if garment.name not in method.codes:
-                raise DatasetError(
-                    f"{method.name} has no code for the training garment {garment.name!r}; "
-                    "was it trained on this data set?"
-                )
             code = method.codes[garment.name]
         else:
             code = method.fit(truth)
             head["fit_s"] = time.perf_counter() - began
     except GeometryError as error:
-        return [{**head, "resolution": r, "error": str(error)} for r in options.resolutions]
+        return [{**head, "resolution": r, "error": str(error)} for r in resolutions]
     head["code"] = [float(value) for value in code]
     rows = []
-    for resolution in options.resolutions:
-        if resolution == max(options.resolutions) and not finest:
-            continue
+    for resolution in resolutions:
         row = {**head, "resolution": resolution}
         try:
             with PeakMemory() as memory:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from isp_assets.bundle import GarmentBundle
 from isp_assets.decode import decode_with_report
-from isp_assets.errors import BundleError, DecodeError, InputError
+from isp_assets.errors import BundleError, DecodeError, GeometryError, InputError
 from isp_assets.fit_search import CodeSpace
 from isp_assets.garment import Garment
 from isp_assets.geometry.folds import folded_faces
@@ -178,10 +178,18 @@ def _usual_openings(bundle: GarmentBundle, resolution: int) -> set[int]:
             garment, _ = decode_with_report(bundle.model, code, resolution=resolution)
         except DecodeError:
             continue
-        loops = len(boundary_loops(garment.faces))
+        loops = _openings(garment)
         counts[loops] = counts.get(loops, 0) + 1
     enough = min(3, len(bundle.codes))
     return {loops for loops, count in counts.items() if count >= enough} or set(counts)
+
+
+def _openings(garment: Garment) -> int:
+    """Number of border loops; -1 where two of them touch."""
+    try:
+        return len(boundary_loops(garment.faces))
+    except GeometryError:
+        return -1
 
 
 def _outcome(garment: Garment, usual: set[int]) -> dict[str, Any]:
@@ -189,7 +197,7 @@ def _outcome(garment: Garment, usual: set[int]) -> dict[str, Any]:
         garment.rest_vertices.astype(np.float64), garment.faces, hinges(garment.faces).faces
     )
     return {
-        "unsewn": len(boundary_loops(garment.faces)) not in usual,
+        "unsewn": _openings(garment) not in usual,
         "share": float(folded.mean()),
     }
 

@@ -38,7 +38,10 @@ def keep_fewer_maps(bundle: GarmentBundle, count: int, *, seed: int = 0) -> tupl
         have = 0 if field is None else field.config.basis
         raise TrainError(f"bundle {bundle.category!r} has {have} displacement maps; cannot keep {count}")
     fewer, lost = truncated(field, usual_coefficients(bundle, field, seed=seed), count)
-    return replace(bundle, drape_field=fewer), lost
+    # The old figures are those of the old network; training it further gives new ones.
+    metrics = {name: value for name, value in bundle.metrics.items() if name != "drape"}
+    notes = {**bundle.provenance, "fewer_maps": {"kept": count, "lost": lost}}
+    return replace(bundle, drape_field=fewer, metrics=metrics, provenance=notes), lost
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from isp_assets.errors import GarmentError
 from isp_assets.train.landmarks import Landmarks, RestBody
 from isp_assets.train.pattern import (
     Curve,
@@ -211,6 +212,8 @@ def _with_collar(over: Curve, p: TopParameters) -> Curve:
     corner = over[-1]
     bend = min(0.015, 0.5 * p.collar)
     kept = over[over[:, 0] > corner[0] + bend]
+    if len(kept) == 0:
+        raise GarmentError("the collar leaves no shoulder between itself and the armhole")
     rounded = bezier(kept[-1], corner, (corner[0], corner[1] + bend), 6)
     return np.concatenate([kept[:-1], rounded, [(corner[0], corner[1] + p.collar)]])
 
