@@ -28,7 +28,7 @@ from isp_assets.fit_search import CodeSpace, FitOptions, Search, SearchState
 from isp_assets.garment_clouds import GarmentClouds
 from isp_assets.geometry.surface_distance import Surface, SurfaceDistance, surface_distance
 
-_CHOICE_SAMPLES = 600
+_CHOICE_SAMPLES, _CHOICE_GARMENTS = 600, 50
 _STALLED = 0.995  # a round that leaves more than this of the energy is the last
 
 
@@ -97,13 +97,15 @@ def choose_bundle(
         return next(iter(bundles.values()))
     scores: dict[str, float] = {}
     for file, bundle in bundles.items():
-        fitter = Fitter(bundle)
+        codes = np.stack(list(bundle.codes.values()))
+        some = np.unique(np.linspace(0, len(codes) - 1, _CHOICE_GARMENTS).astype(int))
+        clouds = GarmentClouds.build(bundle.model, codes[some])
         try:
-            place = alignment or detect_alignment(surface, fitter.clouds)
+            place = alignment or detect_alignment(surface, clouds)
         except MeshError:
             continue
         points, _ = place.apply(surface).sample(_CHOICE_SAMPLES, np.random.default_rng(0))
-        scores[file] = float(fitter.clouds.distances(points).min())
+        scores[file] = float(clouds.distances(points).min())
     if not scores:
         raise MeshError(
             f"in no unit has the mesh the size of a garment ({', '.join(known)}); give --align, or scale it"
