@@ -96,6 +96,7 @@ def draw(rows: list[dict[str, Any]], path: Path, title: str) -> None:
         axes.annotate(row["size"], (row["decode_ms"], row["train_mean_mm"]), xytext=(4, 6),
                       textcoords="offset points", fontsize=8)  # fmt: skip
     axes.set(xlabel="decode at 256 cells [ms]", ylabel="mm", title=title, ylim=(0, None))
+    axes.margins(x=0.18)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=110, metadata={"Software": None})
