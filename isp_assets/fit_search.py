@@ -38,9 +38,9 @@ class FitOptions:
     """Garments to start from, besides the mean."""
     trial_iterations: int = 8
     """Of L-BFGS from every start."""
-    rounds: int = 4
+    rounds: int = 8
     """How often the panels are cut anew, from the best start on."""
-    iterations: int = 25
+    iterations: int = 50
     """Of L-BFGS a round, at the most."""
     resolution: int = 64
     """Grid cells across a panel's square while fitting."""

@@ -18,7 +18,7 @@ from isp_assets.fit_objective import Distance, FitWeights, Target
 from isp_assets.fit_search import CodeSpace, FitOptions
 from isp_assets.geometry.surface_distance import Surface, surface_distance
 
-OPTIONS = FitOptions(neighbours=1, resolution=32, samples=800, iterations=20)
+OPTIONS = FitOptions(neighbours=1, resolution=32, samples=800, rounds=4, iterations=20)
 CODES = {
     "a": np.array([-0.05, -0.04], np.float32),
     "b": np.array([0.06, 0.0], np.float32),
