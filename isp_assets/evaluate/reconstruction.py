@@ -198,8 +198,7 @@ def half_diagonal(dataset: GarmentDataset) -> float:
 
 def garment_surface(garment: TrainingGarment) -> Surface:
     """The sewn rest shape of a training garment."""
-    faces = [panel.vertex_index[panel.faces] for panel in garment.panels.values()]
-    return Surface(garment.rest_vertices, np.concatenate(faces).astype(np.int64))
+    return Surface(garment.rest_vertices, garment.faces.astype(np.int64))
 
 
 def _chosen(dataset: GarmentDataset, count: int) -> list[TrainingGarment]:

@@ -72,6 +72,11 @@ class TrainingGarment:
     parameters: Mapping[str, float]
     metrics: Mapping[str, float]
 
+    @property
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        """Triangles of the sewn garment, front panel first."""
+        return np.concatenate([panel.vertex_index[panel.faces] for panel in self.panels.values()])
+
 
 @dataclass(frozen=True, eq=False)
 class GarmentDataset:

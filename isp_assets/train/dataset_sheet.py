@@ -75,11 +75,10 @@ def _draw_view(axes, garment: TrainingGarment, sign: float) -> None:
     """The rest shape seen along z, its far faces drawn first."""
     from matplotlib.collections import PolyCollection
 
-    faces = np.concatenate([panel.vertex_index[panel.faces] for panel in garment.panels.values()])
     turned = garment.rest_vertices * np.array([sign, 1.0, sign])
-    corner = turned[faces]
+    corner = turned[garment.faces]
     order = np.argsort(corner[..., 2].mean(axis=1))
-    colors = _shaded(unit_face_normals(turned, faces))
+    colors = _shaded(unit_face_normals(turned, garment.faces))
     polygons = PolyCollection(list(corner[order][..., :2]), facecolors=colors[order], edgecolors="face")
     polygons.set_linewidth(0.2)
     axes.add_collection(polygons)

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isp_assets.conventions import PANELS
 from isp_assets.train.dataset import GarmentDataset, TrainingGarment
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -29,9 +28,7 @@ class UdfSamplingOptions:
 
 def rest_mesh(garment: TrainingGarment) -> Mesh:
     """The sewn garment on the rest body [m], faces outwards."""
-    panels = [garment.panels[side] for side in PANELS]
-    faces = np.concatenate([panel.vertex_index[panel.faces] for panel in panels])
-    return np.asarray(garment.rest_vertices, float), faces.astype(np.int64)
+    return np.asarray(garment.rest_vertices, float), garment.faces.astype(np.int64)
 
 
 def unit_box(dataset: GarmentDataset, margin: float = 0.05) -> tuple[tuple[float, float, float], float]:
