@@ -95,6 +95,80 @@ def decode(
     _print("decode", rows)
 
 
+@evaluate_app.command("draping")
+def draping(
+    out: OutOption,
+    tests: Annotated[str | None, typer.Option(help="Tests to run, as T1,T4; all without it.")] = None,
+    collection: Annotated[str, typer.Option(help="Collection folder.")] = "default",
+    folder: Annotated[Path | None, typer.Option("--motions", help="Folder of held-out clips.")] = None,
+    clips: Annotated[str, typer.Option(help="Names of clips in that folder, separated by commas.")] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer values of every sweep.")] = False,
+) -> None:
+    """Stress tests of draping: the value at which every sweep first fails, and pictures of the worst."""
+    from isp_assets.evaluate.draping import LIMITS, digest_of, evaluate_draping, layer_times
+    from isp_assets.evaluate.stress_measures import FIGURES
+    from isp_assets.evaluate.stress_tests import StressSetup, stress_cases
+    from isp_assets.evaluate.table import write_table
+    from isp_assets.train.cpu import prepare_cpu
+
+    prepare_cpu(1)
+    setup = StressSetup.load(collection, folder=folder, clips=_names(clips), quick=quick)
+    cases = stress_cases(setup, _names(tests) if tests else None)
+    with _bar() as report:
+        table = evaluate_draping(cases, out, networks=digest_of(setup.collection.folder), progress=report)
+    times = {"layer_times": layer_times(table.rows)}
+    write_table(out, "draping", table.rows, meanings=FIGURES, details=times)
+    write_table(out, "limits", table.limits, meanings=LIMITS, details=times)
+    _print("limits of draping", table.limits)
+
+
+@evaluate_app.command("physics")
+def physics(
+    out: OutOption,
+    outfits: Annotated[
+        list[str], typer.Option("--outfit", help="Garments, innermost first, as tank_top,trousers; repeat.")
+    ],
+    motion: Annotated[str, typer.Option(help="A built-in motion, or an .npz.")] = "walk",
+    frames: Annotated[str, typer.Option(help="Frame range.")] = "11-20",
+    reference: Annotated[
+        str, typer.Option(help="'energy', or the name of an installed solver such as 'newton'.")
+    ] = "newton",
+    collection: Annotated[str, typer.Option(help="Collection folder.")] = "default",
+    resolution: Annotated[int, typer.Option(help="Grid cells across a panel.")] = 96,
+    hold_frames: Annotated[int, typer.Option(help="Frames whose rungs the solver starts from.")] = 2,
+    hold_steps: Annotated[int, typer.Option(help="Steps with the pose held.")] = 60,
+) -> None:
+    """Each rung of draping against a physical equilibrium: energies, stretch, distances, time."""
+    from isp_assets.evaluate.physics import FIGURES, HOLD_FIGURES, PhysicsOptions
+    from isp_assets.evaluate.physics_task import PhysicsTask
+    from isp_assets.evaluate.table import write_table
+    from isp_assets.pipeline import split_names
+    from isp_assets.train.cpu import prepare_cpu
+
+    prepare_cpu(1)
+    options = PhysicsOptions(hold_frames=hold_frames, hold_steps=hold_steps)
+    task = PhysicsTask.load(reference, motion, frames, collection=collection, resolution=resolution)
+    rows: list[dict[str, Any]] = []
+    holds: list[dict[str, Any]] = []
+    details: dict[str, Any] = {}
+    for text in outfits:
+        with _bar() as report:
+            found = task.evaluate(split_names(text), options, progress=report)
+        rows += [{"outfit": text, **row} for row in found.rows]
+        holds += [{"outfit": text, **row} for row in found.holds]
+        details[text] = found.details
+        write_table(out, "physics", rows, meanings=FIGURES, details={"reference": details})
+        if holds:
+            write_table(out, "physics_starts", holds, meanings=HOLD_FIGURES, details={})
+    _print("physics", rows)
+    if holds:
+        _print("rungs as a start for the solver", holds)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
 def _numbers(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in text.split(","))

@@ -16,6 +16,7 @@ from typing import Any
 from isp_assets.drape import DrapeOptions, drape
 from isp_assets.errors import IspAssetsError, PluginError
 from isp_assets.evaluate.frames import FrameMeter, summarise
+from isp_assets.evaluate.job_warnings import job_warnings
 from isp_assets.evaluate.table import machine
 from isp_assets.files import write_text
 from isp_assets.frames import DrapedFrames, FrameChunk
@@ -167,6 +168,7 @@ def _report(
             if stage not in ("prepare", "total")
         },
         "peak_memory_mib": round(_peak_memory_mib(), 1),
+        "warnings": job_warnings(rows, scene.layers, job.shot),
         "summary": summarise(rows),
         "frames": rows,
         "files": {name: {"path": p.name, "bytes": p.stat().st_size} for name, p in paths.items()},

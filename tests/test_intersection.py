@@ -127,3 +127,14 @@ def test_bad_input_is_refused() -> None:
         _beneath(sheet, closed=True)
     with pytest.raises(GeometryError, match="NaN"):
         measure_intersection(np.full((3, 3), np.nan), np.array([[0, 1, 2]]), _beneath(BALL))
+
+
+def test_crossing_pairs_come_in_one_order() -> None:
+    """They are found by several threads; what lifts them must not depend on which was first."""
+    rng = np.random.default_rng(0)
+    faces = np.arange(900).reshape(-1, 3)
+    first, second = (rng.uniform(size=(300, 1, 3)) + 0.1 * rng.normal(size=(300, 3, 3)) for _ in range(2))
+    found = [crossing_pairs(first.reshape(-1, 3), faces, second.reshape(-1, 3), faces) for _ in range(5)]
+    assert len(found[0]) > 100
+    assert all(np.array_equal(found[0], again) for again in found[1:])
+    np.testing.assert_array_equal(found[0], np.unique(found[0], axis=0))

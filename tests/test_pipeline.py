@@ -72,6 +72,9 @@ def test_files_and_report(tmp_path: Path) -> None:
     assert set(report["summary"]) == {"final", *STEPS} - {"project"}
     assert report["files"]["usd"]["bytes"] == (tmp_path / "job.usdc").stat().st_size
     assert report["peak_memory_mib"] > 100
+    for warning in report["warnings"]:
+        assert {"kind", "subject", "worst", "limit", "message"} <= set(warning)
+        assert warning["worst"] > warning["limit"]
 
 
 @pytest.mark.parametrize("fail_at", ["begin", "add", "finish"])

@@ -11,7 +11,7 @@ def crossing_pairs(
     other_vertices: Float[np.ndarray, "W 3"],
     other_faces: Int[np.ndarray, "G 3"],
 ) -> Int[np.ndarray, "n 2"]:
-    """All pairs (face, other face) that share a point; touching counts.
+    """All pairs (face, other face) that share a point, sorted; touching counts.
 
     Faces outside the other mesh's bounding box are put aside first, so meshes that
     lie apart cost next to nothing.
@@ -31,7 +31,8 @@ def crossing_pairs(
         np.ascontiguousarray(other_faces[theirs], np.int64),
     )
     pairs = pairs.reshape(-1, 2)
-    return np.stack([mine[pairs[:, 0]], theirs[pairs[:, 1]]], axis=1)
+    pairs = np.stack([mine[pairs[:, 0]], theirs[pairs[:, 1]]], axis=1)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # several threads find them, in any order
 
 
 def _inside_box(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
