@@ -43,6 +43,11 @@ class TestLimits:
         assert (limit["good_up_to"], limit["fails_at"]) == (None, 1.0)
         assert limit["at_the_end"] == "all criteria hold"
 
+    def test_every_criterion_has_its_own_limit(self):
+        rows = [row(1.0, flipped_percent=1.0), row(2.0), row(3.0, strain_p99_max=1.0, flipped_percent=1.0)]
+        (limit,) = find_limits(rows)
+        assert set(limit["each"].split("; ")) == {"flipped_percent at 1", "strain_p99_max at 3"}
+
     def test_sweeps_without_failure_have_no_limit(self):
         (limit,) = find_limits([row(1.0), row(2.0)])
         assert (limit["good_up_to"], limit["fails_at"], limit["fails_first"]) == (2.0, None, "")

@@ -16,7 +16,7 @@ import numpy as np
 
 import isp_assets
 from isp_assets.errors import IspAssetsError
-from isp_assets.evaluate.criteria import failures
+from isp_assets.evaluate.criteria import CRITERIA, failures
 from isp_assets.evaluate.draping_pictures import Picture, draw
 from isp_assets.evaluate.stress_case import StressCase, StressRun
 from isp_assets.evaluate.stress_measures import Measured, measure
@@ -27,6 +27,7 @@ LIMITS: dict[str, str] = {
     "good_up_to": "last value before the first failure",
     "fails_at": "first value at which a criterion does not hold",
     "fails_first": "which ones, there",
+    "each": "where every criterion that does not hold throughout first fails",
     "at_the_end": "what the hardest value gives",
     "end_value": "the hardest value",
 }
@@ -138,7 +139,15 @@ def _limit(test: str, label: str, sweep: Sequence[Mapping[str, Any]]) -> dict[st
         }
     else:
         row |= {"good_up_to": last["value"], "fails_at": None, "fails_first": ""}
-    return row | {"end_value": last["value"], "at_the_end": end}
+    return row | {"each": _each(sweep), "end_value": last["value"], "at_the_end": end}
+
+
+def _each(sweep: Sequence[Mapping[str, Any]]) -> str:
+    first: dict[str, float] = {}
+    for row in reversed(sweep):
+        first |= {c.column: row["value"] for c in CRITERIA if c.severity(row) > 1}
+        first |= {"error": row["value"]} if row.get("error") else {}
+    return "; ".join(f"{column} at {value:g}" for column, value in first.items())
 
 
 def _finished(path: Path, mark: str) -> dict[str, Any] | None:

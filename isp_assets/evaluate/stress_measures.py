@@ -22,6 +22,7 @@ FIGURES: dict[str, str] = {
     "layers": "garments worn",
     "body_area_mean": "area inside the body, where room was left for cloth, of the worst layer: mean [%]",
     "body_area_max": "the same in the worst frame [%]",
+    "body_unavoidable_max": "area inside the body where the body leaves no room for cloth, worst frame [%]",
     "inner_area_mean": "area inside a layer beneath, of the worst layer: mean [%]",
     "inner_area_max": "the same in the worst frame [%]",
     "before_body_area_max": "inside the body before projection, worst frame [%]",
@@ -32,9 +33,12 @@ FIGURES: dict[str, str] = {
     "strain_p99_max": "the same in the worst frame",
     "flipped_percent": "faces folded over, worst layer and frame [%]",
     "jump_ratio": "longest way of a garment vertex from frame to frame over the longest of the body, largest",
-    "anchor_jump_ratio": "the same for cloth within 3 cm of a waistband",
+    "before_jump_ratio": "the same before projection",
+    "anchor_jump_ratio": "the same for cloth within 3 cm of a waistband, after projection",
     "jerk_ratio": "jerk of a garment over that of the skin beneath it, worst layer",
+    "before_jerk_ratio": "the same before projection",
     "noise_gain": "scatter of a garment under noise in the pose over that of the skin beneath, worst layer",
+    "before_noise_gain": "the same before projection",
     "far_percent": "vertices more than 15 cm off the body, worst layer and frame [%]",
     "corrected_3cm": "vertices that projection moved by more than 3 cm, worst layer and frame",
     "corrected_mm": "longest way of a vertex in projection [mm]",
@@ -110,6 +114,8 @@ def _worst_layer(figures: Mapping[str, float], faces: Mapping[str, int]) -> dict
         stage, layer, figure = key.split("/")
         if figure == "flipped_faces":
             figure, value = "flipped_percent", 100 * value / faces[layer]
+        elif figure == "body_unavoidable_percent":
+            figure = "body_unavoidable_max"
         name = figure if stage == FINAL else f"before_{figure}"
         found[name] = max(found.get(name, 0.0), value)
     return found
@@ -121,7 +127,9 @@ _MEAN_AND_MAX = {
     "strain_p99": "strain_p99",
 }
 _MAX = (
-    "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio", "anchor_jump_ratio", "far_percent",
+    "body_unavoidable_max", "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio",
+    "before_jump_ratio",
+    "anchor_jump_ratio", "far_percent",
     "corrected_3cm", "corrected_mm", "difference_mm",
 )  # fmt: skip
 
@@ -146,7 +154,9 @@ def _over_time(case: StressCase, run: StressRun, rows: Bool[np.ndarray, " T"]) -
     found: dict[str, float] = {}
     for name, figure in (("jerk_ratio", jerk_ratio), ("noise_gain", noise_gain)):
         if name in case.measures and rows.sum() >= 4:
-            found[name] = max(_against_skin(run, layer, rows, name, figure) for layer in run.layers)
+            for prefix, layers in (("", run.layers), ("before_", run.before or ())):
+                ratios = [_against_skin(run, layer, rows, name, figure) for layer in layers]
+                found |= {f"{prefix}{name}": max(ratios)} if ratios else {}
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
@@ -163,7 +173,12 @@ def _against_skin(
 
 
 def _jumps(run: StressRun) -> dict[str, Float[np.ndarray, " T"]]:
-    return {"jump_ratio": np.max([jump_ratios(layer, run.body) for layer in run.layers], axis=0)}
+    states = {"jump_ratio": run.layers, "before_jump_ratio": run.before or ()}
+    return {
+        name: np.max([jump_ratios(layer, run.body) for layer in layers], axis=0)
+        for name, layers in states.items()
+        if layers
+    }
 
 
 def _anchor_jumps(run: StressRun) -> dict[str, Float[np.ndarray, " T"]]:

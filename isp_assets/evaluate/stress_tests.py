@@ -149,9 +149,12 @@ def stress_cases(setup: StressSetup, tests: Sequence[str] | None = None) -> list
 def _placed(setup: StressSetup, test: str, where: str, region: runs.Region) -> Iterator[StressCase]:
     depths = setup.few((2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0))
     motion = motions.arms_swept(setup.figure, [35.0] * len(depths))
-    for name in ("tee", "a_line_skirt"):
+    for name, other in (("tee", "v_neck_shirt"), ("a_line_skirt", "mini_skirt")):
         sweep = Sweep("depth [mm]", depths, ("corrections",))
-        case = setup.case(test, f"contact {where}, {name}", [name, name], motion, sweep)
+        inner = replace(setup.collection.item(name), style=setup.collection.item(other).style)
+        outfit = setup.collection.outfit([name, name])
+        outfit = replace(outfit, items=(inner, outfit.items[1]))  # told apart by their looks only
+        case = setup.case(test, f"contact {where}, {name}", outfit, motion, sweep)
         yield replace(case, run=runs.placed_contact(region))
 
 
