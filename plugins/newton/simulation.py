@@ -43,7 +43,7 @@ class Simulation:
     """The state of all garments, and one step at a time. Positions are in the space of the scene."""
 
     def __init__(self, scene: PhysicsScene, options: NewtonOptions) -> None:
-        self.options = options
+        self.options, self._body = options, scene.body[0]
         self._newton, self._warp = import_newton()
         model = self._build(scene)
         config = self._newton.solvers.SolverStyle3D.Config(
@@ -88,7 +88,10 @@ class Simulation:
             positions = now.particle_q.numpy().copy()
             positions[self._held] = held
             now.particle_q.assign(positions)
+        # Without the skin's velocity, friction would hold cloth back in space wherever a limb moves fast.
+        self._mesh.velocities.assign(((body - self._body) / seconds).astype(np.float32))
         self._mesh.points.assign(np.ascontiguousarray(body, np.float32))
+        self._body = body
         self._mesh.refit()
         self._pipeline.collide(now, self._contacts)
         now.clear_forces()

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from isp_assets.errors import MissingExtraError, PluginError
 from isp_assets.evaluate.physics import PhysicsOptions, evaluate_physics
@@ -13,7 +14,7 @@ from isp_assets.frames import DrapedFrames
 from isp_assets.physics import Cloth, PhysicsScene, PhysicsSolver, make_solver
 from isp_assets.synthetic import synthetic_shot
 from isp_assets_plugins.newton import NewtonOptions, NewtonSolver
-from isp_assets_plugins.newton.simulation import _wound_alike
+from isp_assets_plugins.newton.simulation import Simulation, _wound_alike
 
 needs_newton = pytest.mark.skipif(
     find_spec("newton") is None, reason="needs the extra: pip install 'isp-assets[newton]'"
@@ -122,6 +123,34 @@ def test_held_vertices_follow_and_travel_changes_nothing() -> None:
     np.testing.assert_allclose(
         moved.states["moving"][0][:, top], _square().cloths[0].start[:, top] + path[:, None], atol=1e-6
     )
+
+
+@needs_newton
+def test_skin_that_slides_drags_the_cloth_along() -> None:
+    """Cloth on a slab: friction speeds it up towards the slab's velocity, and never beyond."""
+    square = _square()
+    flat = square.cloths[0].start[:, :, [0, 2, 1]] * (1, 1, -1) + (0, 0.0045, 0)
+    x, y, z = np.meshgrid([-1.0, 1.5], [-1.0, 0.0], [-1.5, 1.0], indexing="ij")
+    slab = np.stack([x, y, z], -1).reshape(-1, 3)
+    hull = ConvexHull(slab)
+    outward = np.einsum("fc,fc->f", _normals(slab, hull.simplices), hull.equations[:, :3]) > 0
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
+    cloth = replace(square.cloths[0], start=flat, held=np.zeros(0, np.int64))
+    scene = PhysicsScene((cloth,), faces.astype(np.int64), slab[None])
+    simulation = Simulation(scene, NewtonOptions())
+    simulation.place(flat[0])
+    speeds = []
+    for step in range(1, 25):
+        body = slab + np.array([0.1 * step / 240, 0, 0])  # 0.1 m/s
+        simulation.step(body, np.zeros((0, 3)), 1 / 240)
+        speeds.append(simulation.save()[1][:, 0].mean())
+    assert 0.03 < speeds[-1] < 0.101
+    assert speeds[2] < speeds[-1]
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corner = vertices[faces]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 @needs_newton
