@@ -16,6 +16,7 @@ from isp_assets.evaluate.stress_case import StressCase, StressRun, drape_case
 from isp_assets.evaluate.stress_measures import FIGURES, measure
 from isp_assets.evaluate.stress_setup import StressSetup, Sweep
 from isp_assets.evaluate.stress_tests import TESTS, stress_cases
+from isp_assets.evaluate.temporal import skin_beneath
 from isp_assets.synthetic import synthetic_shot
 
 
@@ -159,6 +160,16 @@ class TestMeasuring:
         assert (found.worst, found.severity) == (3, np.inf)
         json.dumps(found.rows, allow_nan=False)
 
+    def test_layers_put_in_the_way_are_not_judged(self, setup):
+        case = fake_case(setup, Fake())
+        run = case.drape()
+        broken = run.layers[0].copy()
+        broken[:, ::2] += 0.3  # strained and folded, and in the way of nobody
+        run = replace(run, layers=(broken, run.layers[1]), before=None)
+        judged, spared = (measure(case, replace(run, placed=n)).rows[0] for n in (0, 1))
+        assert judged["strain_p99_max"] > 1
+        assert spared["strain_p99_max"] == measure(case, case.drape()).rows[0]["strain_p99_max"]
+
     @pytest.mark.parametrize("error", [DrapeError, ZeroDivisionError])
     def test_an_error_is_a_row_and_spares_the_other_values(self, setup, error, tmp_path):
         case = fake_case(setup, Fake(breaks_at=2.0, error=error))
@@ -242,10 +253,13 @@ class TestRealCases:
         case = self.small(setup, ["tee", "open_jacket"], (3.0, 3.0))
         run = runs.smoothed(3)(case)
         assert run.before is not None
-        first, second = drape_case(case).layers[0]
-        np.testing.assert_allclose(run.before[0][0], (2 * first + second) / 3, atol=1e-6)
+        plain = drape_case(case)
+        nearest = skin_beneath(plain.layers[0][0], plain.body[0])
+        first, second = plain.layers[0] - plain.body[:, nearest]
+        expected = plain.body[0, nearest] + (2 * first + second) / 3
+        np.testing.assert_allclose(run.before[0][0], expected, atol=1e-6)
         (row,) = measure(case, run).rows
-        assert row["body_area_max"] <= row["before_body_area_max"]
+        assert {"before_body_area_max", "before_inner_area_max", "body_area_max"} <= set(row)
         assert row["corrected_mm"] > 0
 
 

@@ -31,6 +31,8 @@ class StressRun:
     """The same before projection."""
     seconds: float
     """Time that draping took, for all frames, without decoding and binding."""
+    placed: int = 0
+    """So many of the innermost layers are put in the way by the test, and are not judged."""
     difference: Float[np.ndarray, " T"] | None = None
     """Largest distance of any vertex from a reference run [m], where the case has one."""
 

@@ -89,7 +89,7 @@ def measure(case: StressCase, run: StressRun) -> Measured:
 def _frame_figures(case: StressCase, run: StressRun) -> list[dict[str, float]]:
     """Figures of every frame, the worst layer each."""
     meter = FrameMeter(run.scene)
-    faces = {layer.name: len(layer.garment.faces) for layer in run.scene.layers}
+    faces = {layer.name: len(layer.garment.faces) for layer in run.scene.layers[run.placed :]}
     series = {name: SERIES[name](run) for name in case.measures if name in SERIES}
     frames = []
     for t in range(len(case.values)):
@@ -109,9 +109,12 @@ def _frame_figures(case: StressCase, run: StressRun) -> list[dict[str, float]]:
 
 
 def _worst_layer(figures: Mapping[str, float], faces: Mapping[str, int]) -> dict[str, float]:
+    """The largest of every figure over the layers that ``faces`` counts the faces of."""
     found: dict[str, float] = {}
     for key, value in figures.items():
         stage, layer, figure = key.split("/")
+        if layer not in faces:
+            continue
         if figure == "flipped_faces":
             figure, value = "flipped_percent", 100 * value / faces[layer]
         elif figure == "body_unavoidable_percent":

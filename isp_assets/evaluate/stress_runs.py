@@ -15,6 +15,7 @@ from isp_assets.body import PosedBody
 from isp_assets.conventions import PANELS
 from isp_assets.dressing import WornGarment, dress
 from isp_assets.evaluate.stress_case import StressCase, StressRun, drape_case
+from isp_assets.evaluate.temporal import skin_beneath
 from isp_assets.garment import Garment
 from isp_assets.geometry.closest import SurfaceNormals
 from isp_assets.geometry.contact import Surface
@@ -59,6 +60,7 @@ def placed_contact(region: Region) -> Callable[[StressCase], StressRun]:
             body=base.body,
             layers=(inner.astype(np.float32), settled),
             before=(inner.astype(np.float32), lifted),
+            placed=1,
             seconds=base.seconds + time.perf_counter() - start,
         )
 
@@ -86,11 +88,11 @@ def along_the_sides(garment: Garment, names: dict[int, str]) -> Float[np.ndarray
 
 
 def smoothed(width: int) -> Callable[[StressCase], StressRun]:
-    """Average finished positions over ``width`` frames, then project once more."""
+    """Average over ``width`` frames how the finished cloth lies to its skin, then project once more."""
 
     def run(case: StressCase) -> StressRun:
         base = drape_case(replace(case, run=None))
-        calm = tuple(uniform_filter1d(p, width, axis=0, mode="nearest") for p in base.layers)
+        calm = tuple(_calmed(positions, base.body, width) for positions in base.layers)
         start = time.perf_counter()
         worn = _worn(case)
         skin = _body_collision(case)
@@ -211,6 +213,14 @@ def _posed(case: StressCase) -> PosedBody:
         betas=torch.as_tensor(case.shot.betas, dtype=torch.float32),
         translation=torch.as_tensor(motion.translation, dtype=torch.float32),
     )
+
+
+def _calmed(
+    positions: Float[np.ndarray, "T V 3"], body: Float[np.ndarray, "T N 3"], width: int
+) -> Float[np.ndarray, "T V 3"]:
+    """Offsets from the skin beneath, averaged over time; so cloth does not lag behind a walking body."""
+    skin = body[:, skin_beneath(positions[0], body[0])]
+    return skin + uniform_filter1d(positions - skin, width, axis=0, mode="nearest")
 
 
 def _worn(case: StressCase) -> tuple[WornGarment, ...]:
