@@ -205,6 +205,18 @@ class TestMeasuring:
         assert seen == [(0, 1), (1, 1)]
 
 
+def test_runs_are_compared_in_the_frames_they_share(setup):
+    """At twice the rate every second frame is one of the slow run; there the shift is found."""
+    case = fake_case(setup, Fake())
+
+    def shifted(case: StressCase) -> StressRun:
+        run = Fake()(case)
+        return replace(run, layers=tuple(layer + np.float32(0.01) for layer in run.layers))
+
+    found = runs._distance(shifted(case).layers, [layer[::2] for layer in case.drape().layers], 2)
+    np.testing.assert_allclose(found, [0.01 * 3**0.5, 0, 0.01 * 3**0.5, 0], rtol=1e-4)
+
+
 class TestRealCases:
     """Coarse and short: the paths through draping, not its quality."""
 
@@ -225,6 +237,8 @@ class TestRealCases:
         run = runs.compared_with(change=lambda c: replace(c, options=replace(c.options, chunk=16)))(chunked)
         assert run.difference is not None
         assert run.difference.max() < 0.02, "the last bits differ, and what crosses is lifted or not"
+        assert run.difference_before is not None
+        assert run.difference_before[0] >= 0
         low = replace(case, outfit=runs.lower_precision(case.outfit, torch.bfloat16))
         run = runs.compared_with(change=lambda c: replace(c, outfit=case.outfit))(low)
         assert run.difference is not None

@@ -35,6 +35,8 @@ class StressRun:
     """So many of the innermost layers are put in the way by the test, and are not judged."""
     difference: Float[np.ndarray, " T"] | None = None
     """Largest distance of any vertex from a reference run [m], where the case has one."""
+    difference_before: Float[np.ndarray, " T"] | None = None
+    """The same before projection [m]."""
 
 
 @dataclass(frozen=True, eq=False)

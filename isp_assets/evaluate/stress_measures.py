@@ -43,6 +43,7 @@ FIGURES: dict[str, str] = {
     "corrected_3cm": "vertices that projection moved by more than 3 cm, worst layer and frame",
     "corrected_mm": "longest way of a vertex in projection [mm]",
     "difference_mm": "largest distance from the reference run [mm]",
+    "before_difference_mm": "the same before projection",
     "non_finite": "positions that are NaN or infinite",
     "seconds": "time that a frame took [s]",
     "passed": "whether every criterion holds",
@@ -104,6 +105,8 @@ def _frame_figures(case: StressCase, run: StressRun) -> list[dict[str, float]]:
             figures |= {name: float(v[t]) for name, v in columns.items() if np.isfinite(v[t])}
         if run.difference is not None:
             figures["difference_mm"] = 1e3 * float(run.difference[t])
+        if run.difference_before is not None:
+            figures["before_difference_mm"] = 1e3 * float(run.difference_before[t])
         frames.append(figures)
     return frames
 
@@ -133,7 +136,7 @@ _MAX = (
     "body_unavoidable_max", "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio",
     "before_jump_ratio",
     "anchor_jump_ratio", "far_percent",
-    "corrected_3cm", "corrected_mm", "difference_mm",
+    "corrected_3cm", "corrected_mm", "difference_mm", "before_difference_mm",
 )  # fmt: skip
 
 

@@ -129,11 +129,11 @@ def compared_with(
             values = (0.0,) * len(motion)
             other = replace(other, values=values, shot=replace(other.shot, motion=motion))
         reference = drape_case(other)
-        difference = np.zeros(len(case.values))
-        for mine, theirs in zip(own.layers, reference.layers, strict=True):
-            far = np.linalg.norm(mine[::every][: len(theirs)] - theirs, axis=2).max(1)
-            difference[::every][: len(far)] = np.maximum(difference[::every][: len(far)], far)
-        return replace(own, difference=difference)
+        return replace(
+            own,
+            difference=_distance(own.layers, reference.layers, every),
+            difference_before=_distance(own.before or (), reference.before or (), every),
+        )
 
     return run
 
@@ -213,6 +213,17 @@ def _posed(case: StressCase) -> PosedBody:
         betas=torch.as_tensor(case.shot.betas, dtype=torch.float32),
         translation=torch.as_tensor(motion.translation, dtype=torch.float32),
     )
+
+
+def _distance(
+    own: Sequence[Float[np.ndarray, "T _ 3"]], others: Sequence[Float[np.ndarray, "S _ 3"]], every: int
+) -> Float[np.ndarray, " T"]:
+    """Largest distance of a vertex in the frames that both runs have, 0 in the others."""
+    difference = np.zeros(len(own[0]))
+    for mine, theirs in zip(own, others, strict=True):
+        shared = difference[::every][: len(theirs)]
+        shared[:] = np.maximum(shared, np.linalg.norm(mine[::every][: len(theirs)] - theirs, axis=2).max(1))
+    return difference
 
 
 def _calmed(
