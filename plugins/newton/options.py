@@ -15,9 +15,9 @@ class NewtonOptions:
     """Nonlinear iterations a step."""
     linear_iterations: int = 10
     """Conjugate gradient iterations each."""
-    first_settle: int = 240
+    first_settle: int = 120
     """Steps with the first pose held, before anything is kept."""
-    settle: int = 120
+    settle: int = 60
     """Steps, at most, with a frame's pose held to reach its equilibrium."""
     still: float = 2e-3
     """Root mean square speed at which cloth counts as settled [m/s]."""
