@@ -99,7 +99,7 @@ class _Draper:
         self.shot, self.options = shot, options
         self.body = shot.body.to(options.device)
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
-        self.worn = dress(outfit, self.body, resolution=options.resolution, device=options.device)
+        self.worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
         numbers = shot.motion.frames
         self.scene = Scene(
@@ -219,7 +219,9 @@ class _Draper:
         for t, obstacles in enumerate(state.obstacles):
             if not np.isfinite(vertices[t]).all():
                 raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
-            done = project(vertices[t], worn.collision, obstacles, self.options.projection)
+            done = project(
+                vertices[t], worn.collision, obstacles, self.options.projection, stretch=worn.stretch
+            )
             result[t] = done.vertices
             tight.append(done.tight)
             if done.ran:

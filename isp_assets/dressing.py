@@ -17,11 +17,14 @@ from isp_assets.decode import decode_garment
 from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displacement, panel_sampler
 from isp_assets.frames import Layer
 from isp_assets.garment import Garment
+from isp_assets.geometry.energy import Fabric, cloth_rest
+from isp_assets.geometry.grading import graded_rest
 from isp_assets.geometry.obstacle import CollisionMesh
+from isp_assets.geometry.stretch import StretchLimit
 from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField
 from isp_assets.outfit import Outfit, OutfitItem
-from isp_assets.skinning import BoundGarment, bind
+from isp_assets.skinning import BoundGarment, bind, shape_garment
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +41,18 @@ class WornGarment:
     ramp: Float[Tensor, " V"]
     """0 at vertices that the body itself holds, 1 away from them."""
     collision: CollisionMesh
+    stretch: StretchLimit
 
 
-def dress(outfit: Outfit, body: Body, *, resolution: int, device: str = "cpu") -> tuple[WornGarment, ...]:
+def dress(
+    outfit: Outfit, body: Body, betas: Float[Tensor, " B"], *, resolution: int, device: str = "cpu"
+) -> tuple[WornGarment, ...]:
     """Decode and bind every garment of an outfit, innermost first.
 
     Args:
         outfit: The garments and their networks.
         body: The body that the outfit was trained on, on ``device``.
+        betas: The wearer's shape, on ``device``; patterns are graded to it.
         resolution: Grid cells across a panel; see `decode_garment`.
         device: Where the networks run.
 
@@ -54,17 +61,19 @@ def dress(outfit: Outfit, body: Body, *, resolution: int, device: str = "cpu") -
         DrapeError: If the skin field does not fit the body.
     """
     return tuple(
-        _wear(outfit, index, item, body, resolution=resolution, device=device)
+        _wear(outfit, index, item, body, betas, resolution=resolution, device=device)
         for index, item in enumerate(outfit)
     )
 
 
 @torch.no_grad()
 def _wear(
-    outfit: Outfit, index: int, item: OutfitItem, body: Body, *, resolution: int, device: str
+    outfit: Outfit, index: int, item: OutfitItem, body: Body, betas: Tensor, *, resolution: int, device: str
 ) -> WornGarment:
     garment = decode_garment(item.bundle.model, item.code, resolution=resolution, name=item.name)
     skin = bind(garment, body, outfit.skin.skin_field.to(device))
+    flat = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, Fabric())
+    graded = graded_rest(flat.to(device, torch.float32), skin.canonical, shape_garment(skin, betas))
     ramp = anchor_ramp(garment)
     field, displacement = item.bundle.drape_field, None
     if field is not None:
@@ -81,6 +90,7 @@ def _wear(
         layering=_layering(outfit, garment, item, device),
         ramp=torch.as_tensor(ramp, device=device),
         collision=CollisionMesh.build(garment.faces, skin.joint_weights.cpu().numpy()),
+        stretch=StretchLimit.build(graded, held=ramp == 0),
     )
 
 

@@ -24,7 +24,7 @@ def sheet(count: int, *, size: float = 0.2, height: float = 0.0) -> tuple[np.nda
     """A square sheet in the xz plane, facing up: vertices and faces."""
     axis = np.linspace(-size / 2, size / 2, count)
     z, x = np.meshgrid(axis, axis, indexing="ij")
-    return np.stack([x, np.full_like(x, height), z], -1).reshape(-1, 3), grid(count, count)[:, ::-1]
+    return np.stack([x, np.full_like(x, height), z], -1).reshape(-1, 3), grid(count, count)[:, ::-1].copy()
 
 
 def tube(

@@ -15,13 +15,14 @@ from isp_assets.errors import TrainError
 from isp_assets.garment import Garment
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import ClothRest, Fabric, cloth_rest, membrane_energy
+from isp_assets.geometry.grading import face_strain, graded_rest
 from isp_assets.geometry.rotations import axis_angle_to_matrix
 from isp_assets.networks.drape_field import DrapeFieldConfig
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.synthetic import synthetic_garment
 from isp_assets.train import displacement, wardrobe
 from isp_assets.train.displacement import DisplacementOptions, DisplacementTask
-from isp_assets.train.drape_energy import Contact, drape_energies, face_strain, graded_rest
+from isp_assets.train.drape_energy import Contact, drape_energies
 from isp_assets.train.drape_metrics import DrapeCase, minimise
 from isp_assets.train.loop import RunOptions, train
 from isp_assets.train.poses import PoseSource, draw_poses, load_clips

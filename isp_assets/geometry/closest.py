@@ -76,6 +76,30 @@ class Closest:
     """Distance [m], negative on the inner side."""
     on_border: Bool[np.ndarray, " P"]
     """The closest point lies on the open border of the surface: the sign means nothing."""
+    on_cut: Bool[np.ndarray, " P"]
+    """The same for the border of the part of the surface that was searched."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePart:
+    """Some faces of a surface, and the border along which they were cut out of it; static over frames."""
+
+    faces: Int[np.ndarray, " n"]
+    cut_edge: Bool[np.ndarray, " E"]
+    cut_vertex: Bool[np.ndarray, " V"]
+
+    @classmethod
+    def build(cls, topology: SurfaceTopology, faces: Int[np.ndarray, " n"]) -> "SurfacePart":
+        """Find the border of the faces with these indices."""
+        inside = np.zeros(len(topology.faces) + 1, bool)  # the last stands for the -1 of an open border
+        inside[faces] = True
+        first, second = inside[topology.edge_faces].T
+        cut_edge = first != second
+        cut_vertex = np.zeros(len(topology.border_vertex), bool)
+        for corner in range(3):  # the edge opposite to a corner joins the two others
+            of_cut = topology.faces[cut_edge[topology.face_edge[:, corner]]]
+            cut_vertex[np.delete(of_cut, corner, axis=1)] = True
+        return cls(faces, cut_edge, cut_vertex)
 
 
 class SurfaceNormals:
@@ -117,7 +141,7 @@ class ClosestQuery:
         vertices: Float[np.ndarray, "V 3"],
         topology: SurfaceTopology,
         *,
-        subset: Int[np.ndarray, " n"] | None = None,
+        part: SurfacePart | None = None,
         normals: SurfaceNormals | None = None,
     ) -> None:
         """Build the tree.
@@ -125,7 +149,7 @@ class ClosestQuery:
         Args:
             vertices: Positions in this frame [m].
             topology: Connectivity.
-            subset: Search these faces only; sides and borders remain those of the whole surface.
+            part: Search these faces only; sides and borders remain those of the whole surface.
             normals: Normals of the whole surface, where the caller has them already.
 
         Raises:
@@ -138,8 +162,8 @@ class ClosestQuery:
             raise GeometryError("surface positions hold NaN or infinity; check the step before")
         self.vertices = np.ascontiguousarray(vertices, np.float64)
         self.topology = topology
-        self._subset = subset
-        self._searched = topology.faces if subset is None else np.ascontiguousarray(topology.faces[subset])
+        self._part = part
+        self._searched = topology.faces if part is None else np.ascontiguousarray(topology.faces[part.faces])
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self._searched)
         self.normals = normals or SurfaceNormals(self.vertices, topology.faces)
@@ -148,27 +172,29 @@ class ClosestQuery:
         """Closest point, side and pseudonormal of every query point."""
         if len(points) == 0:
             empty = np.zeros((0, 3))
-            return Closest(empty, np.zeros(0, np.int64), empty, empty, np.zeros(0), np.zeros(0, bool))
+            none = np.zeros(0, bool)
+            return Closest(empty, np.zeros(0, np.int64), empty, empty, np.zeros(0), none, none)
         points = np.ascontiguousarray(points, np.float64)
         squared, face, closest = self._tree.squared_distance(self.vertices, self._searched, points)
         face, closest = face.reshape(-1).astype(np.int64), closest.reshape(-1, 3)  # igl gives C's long long
-        if self._subset is not None:
-            face = self._subset[face]
+        if self._part is not None:
+            face = self._part.faces[face]
         weights = barycentric_weights(closest, self.vertices[self.topology.faces[face]])
-        normal, on_border = self._pseudonormals(face, weights)
+        normal, on_border, on_cut = self._pseudonormals(face, weights)
         side = np.where(np.einsum("pc,pc->p", points - closest, normal) < 0, -1.0, 1.0)
-        return Closest(closest, face, weights, normal, side * np.sqrt(squared), on_border)
+        return Closest(closest, face, weights, normal, side * np.sqrt(squared), on_border, on_cut)
 
     def _pseudonormals(
         self, face: Int[np.ndarray, " P"], weights: Float[np.ndarray, "P 3"]
-    ) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+    ) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
         topology, of_faces = self.topology, self.normals.of_faces
         zero = weights < _ON_FEATURE
         zeros = zero[:, 0].astype(np.int8) + zero[:, 1] + zero[:, 2]
         normal = of_faces[face]
-        on_border = np.zeros(len(face), bool)
+        on_border, on_cut = np.zeros(len(face), bool), np.zeros(len(face), bool)
         on_edge = np.flatnonzero(zeros == 1)
-        pair = topology.edge_faces[topology.face_edge[face[on_edge], zero[on_edge].argmax(1)]]
+        edge = topology.face_edge[face[on_edge], zero[on_edge].argmax(1)]
+        pair = topology.edge_faces[edge]
         on_border[on_edge] = pair[:, 1] < 0
         across = np.where(pair[:, 0] == face[on_edge], pair[:, 1], pair[:, 0])
         sum_of_two = normal[on_edge] + np.where(across[:, None] >= 0, of_faces[across], 0)
@@ -179,7 +205,10 @@ class ClosestQuery:
         vertex = topology.faces[face[on_vertex], weights[on_vertex].argmax(1)]
         on_border[on_vertex] = topology.border_vertex[vertex]
         normal[on_vertex] = self.normals.of_vertices[vertex]
-        return normal, on_border
+        if self._part is not None:
+            on_cut[on_edge] = self._part.cut_edge[edge]
+            on_cut[on_vertex] = self._part.cut_vertex[vertex]
+        return normal, on_border, on_cut
 
 
 def unit_face_normals(

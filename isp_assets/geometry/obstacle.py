@@ -17,7 +17,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import Closest, ClosestQuery, SurfaceNormals, SurfaceTopology
+from isp_assets.geometry.closest import (
+    Closest,
+    ClosestQuery,
+    SurfaceNormals,
+    SurfacePart,
+    SurfaceTopology,
+)
 
 BODY_PARTS: dict[str, tuple[int, ...]] = {
     "torso": (0, 3, 6, 9, 13, 14),
@@ -42,6 +48,11 @@ class CollisionMesh:
     """Which of `BODY_PARTS` each vertex belongs to; at least one."""
     part_faces: tuple[Int[np.ndarray, " _"], ...]
     """Faces of each part; parts overlap."""
+
+    @cached_property
+    def part_surfaces(self) -> tuple[SurfacePart, ...]:
+        """Each part as a surface cut out of the whole."""
+        return tuple(SurfacePart.build(self.topology, faces) for faces in self.part_faces)
 
     @cached_property
     def neighbour_average(self) -> csr_array:
@@ -150,6 +161,10 @@ class Obstacle:
                 boxes[part] = corner.min(0), corner.max(0)
         return boxes
 
+    def parts_at(self, face: Int[np.ndarray, " n"]) -> Bool[np.ndarray, "n 6"]:
+        """Parts that each face belongs to."""
+        return self.mesh.parts[self.mesh.topology.faces[face]].any(1)
+
     def contacts(
         self, points: Float[np.ndarray, "P 3"], parts: Bool[np.ndarray, "P 6"], *, within: float
     ) -> Closest:
@@ -160,7 +175,7 @@ class Obstacle:
         """
         best = Closest(
             points.copy(), np.zeros(len(points), np.int64), np.zeros_like(points), np.zeros_like(points),
-            np.full(len(points), np.inf), np.zeros(len(points), bool),
+            np.full(len(points), np.inf), np.zeros(len(points), bool), np.zeros(len(points), bool),
         )  # fmt: skip
         for part, (low, high) in enumerate(self.part_boxes):
             near = parts[:, part] & (points >= low - within).all(1) & (points <= high + within).all(1)
@@ -169,7 +184,7 @@ class Obstacle:
                 continue
             found = self._query(part)(points[index])
             closer = np.abs(found.height) < np.abs(best.height[index])
-            for field in ("point", "face", "weights", "normal", "height", "on_border"):
+            for field in ("point", "face", "weights", "normal", "height", "on_border", "on_cut"):
                 getattr(best, field)[index[closer]] = getattr(found, field)[closer]
         return best
 
@@ -178,7 +193,7 @@ class Obstacle:
             self._queries[part] = ClosestQuery(
                 self.vertices,
                 self.mesh.topology,
-                subset=self.mesh.part_faces[part],
+                part=self.mesh.part_surfaces[part],
                 normals=self.normals,
             )
         return self._queries[part]

@@ -2,18 +2,18 @@
 
 Contact is resolved from both sides: garment vertices are lifted off the surfaces
 beneath, and the corners of garment triangles are lifted over vertices that poke
-through them. Each lift is spread over the neighbourhood, so that no spike stands
-out; the last rounds lift without spreading, down to the pairs of triangles that
-an exact test still finds crossing. Only vertices that came near something are
-looked at again.
+through them. Each lift is spread over the neighbourhood and what it stretched is eased,
+so that no spike stands out; the last rounds lift without spreading, down to the pairs
+of triangles that an exact test still finds crossing. Cloth between two body parts (an
+arm and the torso) is drawn in towards its own part. Only vertices that came near
+something are looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.
 """
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,22 +21,29 @@ from jaxtyping import Bool, Float, Int
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
+from isp_assets.geometry.draw_in import draw_in
+from isp_assets.geometry.lifts import (
+    WATCHED,
+    Neighbour,
+    any_corner,
+    largest_per_vertex,
+    shortest_way,
+    towards,
+)
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import keep_larger, spread
+from isp_assets.geometry.stretch import StretchLimit
 
 BODY_MARGIN = 0.003
 """Clearance to leave over the body [m]."""
 LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
-_CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
-_AROUND = 0.015  # vertices this near [m] at the start make the surface around them a neighbour
-_WATCHED = 0.008  # vertices this near [m] at the start are looked at again in every round
+_ASIDE = 0.06  # cloth this far [m] outside a part's bounds still has its closest point there
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _FINISH_STEP = 0.004  # largest lift [m] of one such correction
-_MOST_RINGS = 8
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
@@ -48,6 +55,8 @@ class ProjectionOptions:
 
     rounds: int = 4
     """Rounds of lifting; the last one does not spread."""
+    ease: int = 2
+    """Steps of easing stretched cloth before the first round; one less after every round but the last."""
     finish: int = 4
     """Rounds of lifting triangles that still cross, at most."""
     spread: int = 8
@@ -55,7 +64,7 @@ class ProjectionOptions:
     reach: float = 0.06
     """Contact deeper than this [m] is left alone: the way out is not known."""
     foreign_reach: float = 0.015
-    """The same for contact with another part of the body."""
+    """The same for another part of the body, where the cloth cannot be drawn in."""
     poke_reach: float = 0.015
     """How far a vertex beneath may poke through a triangle [m] and still lift it."""
     longest_move: float = 0.05
@@ -64,8 +73,8 @@ class ProjectionOptions:
     """Lifts below this [m] count as none."""
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or self.finish < 0 or self.spread < 0:
-            raise GeometryError(f"projection needs rounds >= 1, finish >= 0 and spread >= 0, got {self}")
+        if self.rounds < 1 or min(self.finish, self.spread, self.ease) < 0:
+            raise GeometryError(f"projection needs rounds >= 1, and nothing below 0, got {self}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +98,8 @@ def project(
     mesh: CollisionMesh,
     obstacles: Sequence[Obstacle],
     options: ProjectionOptions | None = None,
+    *,
+    stretch: StretchLimit | None = None,
 ) -> Projection:
     """Lift a garment clear of all obstacles.
 
@@ -97,6 +108,7 @@ def project(
         mesh: The garment's collision data.
         obstacles: What lies beneath: body first, then inner garments.
         options: How hard to work.
+        stretch: The garment's limits of stretch; without them nothing is eased.
 
     Raises:
         GeometryError: If a position is not finite or the mesh does not fit.
@@ -104,33 +116,13 @@ def project(
     start = np.ascontiguousarray(vertices, np.float64)
     if not np.isfinite(start).all():
         raise GeometryError("garment positions hold NaN or infinity; check the networks' output")
-    work = _Projector(start, mesh, obstacles, options or ProjectionOptions())
+    options = options or ProjectionOptions()
+    eased = start if stretch is None else stretch.ease(start, steps=options.ease)
+    work = _Projector(eased, mesh, obstacles, options, stretch)
     rounds = work.lift()
     crossings = work.finish()
     move = float(np.linalg.norm(work.position - start, axis=1).max(initial=0))
     return Projection(work.position, move > 0, rounds, move, work.tight, crossings)
-
-
-class _Neighbour:
-    """What is known of one obstacle: where the garment comes near it."""
-
-    def __init__(self, obstacle: Obstacle, found: Closest, *, edge: float) -> None:
-        self.obstacle = obstacle
-        topology = obstacle.mesh.topology
-        near = found.height < _AROUND
-        close = np.zeros(len(obstacle.vertices), bool)
-        close[topology.faces[found.face[near]]] = True
-        # A garment triangle may span many of the ones beneath: look as far around as it reaches.
-        for _ in range(1 + min(math.ceil(edge / obstacle.mean_edge), _MOST_RINGS)):
-            close[topology.faces[_any_corner(close, topology.faces)]] = True
-        self.found: Closest | None = found
-        """What the first query found, until vertices move."""
-        self.watched = found.height < _WATCHED
-        self.watched_foreign: Bool[np.ndarray, " V"] | None = None
-        self.vertices = np.flatnonzero(close & ~obstacle.tight)
-        self.faces = np.flatnonzero(_any_corner(close, topology.faces))
-        beneath = _any_corner(obstacle.tight, topology.faces)[found.face]
-        self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
 
 
 class _Projector:
@@ -142,12 +134,13 @@ class _Projector:
         mesh: CollisionMesh,
         obstacles: Sequence[Obstacle],
         options: ProjectionOptions,
+        stretch: StretchLimit | None,
     ) -> None:
         self.start = self.position = position
-        self.mesh, self.options = mesh, options
-        first = [o.contacts(position, mesh.parts, within=_AROUND) for o in obstacles]
+        self.mesh, self.options, self.stretch = mesh, options, stretch
+        first = [o.contacts(position, mesh.parts, within=_ASIDE) for o in obstacles]
         edge = mean_edge(position, mesh.topology.faces)
-        self.near = [_Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
+        self.near = [Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
         for neighbour in self.near:
             self.tight |= neighbour.cramped
@@ -166,6 +159,8 @@ class _Projector:
             rings = 0 if last else options.spread
             step = spread(lift, self.mesh.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
             self._move(step)
+            if self.stretch is not None and not last:
+                self._move(self.stretch.ease(self.position, steps=options.ease - 1) - self.position)
         return options.rounds
 
     def finish(self) -> int:
@@ -186,7 +181,7 @@ class _Projector:
     def _move(self, step: Float[np.ndarray, "V 3"]) -> None:
         self.position = self.position + step
         total = self.position - self.start
-        moved = (step != 0).any(1)
+        moved = np.abs(step).max(1) > self.options.tolerance
         far = np.einsum("vc,vc->v", total, total) > self.options.longest_move**2
         if far.any():
             self.tight |= far
@@ -196,34 +191,70 @@ class _Projector:
 
     def _lift_vertices(self, *, foreign: bool) -> Float[np.ndarray, "V 3"]:
         """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
-        own, other = np.zeros_like(self.position), np.zeros_like(self.position)
-        room = np.full(len(self.position), np.inf)
+        own = np.zeros_like(self.position)
+        room, inwards = np.full(len(self.position), np.inf), np.zeros_like(self.position)
         for neighbour in self.near:
             obstacle, index, found = neighbour.obstacle, np.flatnonzero(neighbour.watched), neighbour.found
             if found is None:
-                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=_AROUND)
+                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=_ASIDE)
             else:
                 index = np.arange(len(self.position))
             points = self.position[index]
             margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
-            keep_larger(own, _shortest_way(points, found, margin, self.options.reach), index)
+            keep_larger(own, shortest_way(points, found, margin, self.options.reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
-            if foreign:
-                self._lift_off_other_parts(neighbour, other)
-        size = np.sqrt(np.einsum("vc,vc->v", other, other))
-        other *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
+            if neighbour is self.near[0]:
+                inwards[index] = towards(points, found)
+        if not foreign:
+            return own
+        other = self._leave_other_parts(inwards, room)
         return np.where((own != 0).any(1, keepdims=True), own, other)
 
-    def _lift_off_other_parts(self, neighbour: _Neighbour, lift: Float[np.ndarray, "V 3"]) -> None:
-        obstacle, watched = neighbour.obstacle, neighbour.watched_foreign
+    def _leave_other_parts(
+        self, inwards: Float[np.ndarray, "V 3"], room: Float[np.ndarray, " V"]
+    ) -> Float[np.ndarray, "V 3"]:
+        """Draw in what touches another part; where there is no room for that, lift it by what there is."""
+        lift, touched = np.zeros_like(self.position), np.zeros_like(self.mesh.parts)
+        for neighbour in self.near:
+            index, found = self._foreign_contacts(neighbour)
+            margin = np.full(len(index), neighbour.obstacle.margin)
+            touching = found.height < margin
+            touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
+            way = shortest_way(self.position[index], found, margin, self.options.foreign_reach)
+            keep_larger(lift, way, index)
+        size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
+        lift *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
+        touched &= ~self.mesh.parts
+        index = np.flatnonzero(touched.any(1) & (room < self.options.reach) & (room > 0) & inwards.any(1))
+        if len(index):
+            lift[index], _ = draw_in(
+                self.position[index], inwards[index], room[index],
+                lambda points, rows: self._clearance(points, touched[index[rows]]),
+            )  # fmt: skip
+        return lift
+
+    def _foreign_contacts(self, neighbour: Neighbour) -> tuple[Int[np.ndarray, " n"], Closest]:
+        watched = neighbour.watched_foreign
         index = np.arange(len(self.position)) if watched is None else np.flatnonzero(watched)
-        points = self.position[index]
-        found = obstacle.contacts(points, ~self.mesh.parts[index], within=obstacle.margin)
+        margin = neighbour.obstacle.margin
+        found = _sure(
+            neighbour.obstacle.contacts(self.position[index], ~self.mesh.parts[index], within=margin)
+        )
         if watched is None:
-            neighbour.watched_foreign = found.height < _WATCHED
-        margin = np.full(len(index), obstacle.margin)
-        keep_larger(lift, _shortest_way(points, found, margin, self.options.foreign_reach), index)
+            neighbour.watched_foreign = found.height < WATCHED
+        return index, found
+
+    def _clearance(
+        self, points: Float[np.ndarray, "n 3"], parts: Bool[np.ndarray, "n 6"]
+    ) -> Float[np.ndarray, " n"]:
+        """How far points are above the margins over some parts [m]; negative where they touch."""
+        least = np.full(len(points), np.inf)
+        for neighbour in self.near:
+            margin = neighbour.obstacle.margin
+            found = _sure(neighbour.obstacle.contacts(points, parts, within=margin))
+            least = np.minimum(least, found.height - margin)
+        return least
 
     def _lift_triangles(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
         """Lift the corners of triangles over obstacle vertices that poke through them."""
@@ -245,17 +276,17 @@ class _Projector:
             share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
             size = (found.height[hit] + gap)[:, None] * share
             push = size.clip(0, _POKE_STEP)[..., None] * found.normal[hit][:, None]
-            keep_larger(lift, _largest_per_vertex(corner, push, len(position)))
+            keep_larger(lift, largest_per_vertex(corner, push, len(position)))
         return lift
 
-    def _crossings(self, neighbour: _Neighbour) -> Int[np.ndarray, "n 2"]:
+    def _crossings(self, neighbour: Neighbour) -> Int[np.ndarray, "n 2"]:
         """Crossing pairs of faces that share a body part and have room."""
         obstacle, faces, beneath = (
             neighbour.obstacle,
             self.mesh.topology.faces,
             neighbour.obstacle.mesh.topology.faces,
         )
-        mine = np.flatnonzero(_any_corner(neighbour.watched, faces))
+        mine = np.flatnonzero(any_corner(neighbour.watched, faces))
         pairs = crossing_pairs(self.position, faces[mine], obstacle.vertices, beneath[neighbour.faces])
         pairs = np.stack([mine[pairs[:, 0]], neighbour.faces[pairs[:, 1]]], axis=1)
         above, below = faces[pairs[:, 0]], beneath[pairs[:, 1]]
@@ -274,29 +305,9 @@ class _Projector:
         height = np.einsum("pkc,pc->pk", self.position[faces], plane)
         need = (top[:, None] + _CLEAR - height).clip(0, _FINISH_STEP)
         push = need[..., None] * plane[:, None] * (alike > -_SAME_SIDE)[:, None, None]
-        return _largest_per_vertex(faces, push, len(self.position))
+        return largest_per_vertex(faces, push, len(self.position))
 
 
-def _shortest_way(
-    points: Float[np.ndarray, "P 3"], found: Closest, margin: Float[np.ndarray, " P"], reach: float
-) -> Float[np.ndarray, "P 3"]:
-    """The shortest way from each point to the margin over a surface; none for points that are clear."""
-    touching = (found.height < margin) & (found.height > -reach) & ~found.on_border
-    away = np.where(found.height[:, None] >= 0, points - found.point, found.point - points)
-    length = np.abs(found.height)[:, None]
-    away = np.where(length > 1e-6, away / np.maximum(length, 1e-6), found.normal)
-    return np.where(touching[:, None], (margin - found.height).clip(0, 1)[:, None] * away, 0.0)
-
-
-def _largest_per_vertex(
-    corner: Int[np.ndarray, "n 3"], push: Float[np.ndarray, "n 3 3"], num_vertices: int
-) -> Float[np.ndarray, "V 3"]:
-    vertex, push = corner.reshape(-1), push.reshape(-1, 3)
-    order = np.argsort(np.einsum("vc,vc->v", push, push), kind="stable")
-    largest = np.zeros((num_vertices, 3))
-    largest[vertex[order]] = push[order]  # the last write to a row wins: the longest push
-    return largest
-
-
-def _any_corner(mask: Bool[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
-    return mask[faces[:, 0]] | mask[faces[:, 1]] | mask[faces[:, 2]]
+def _sure(found: Closest) -> Closest:
+    """The same, with infinite heights where the closest point lies on a border and no side is known."""
+    return replace(found, height=np.where(found.on_border | found.on_cut, np.inf, found.height))

@@ -25,9 +25,10 @@ from isp_assets.drape_features import drape_features
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
+from isp_assets.geometry.grading import graded_rest
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.skinning import shape_garment, skin_garment
-from isp_assets.train.drape_energy import Contact, drape_energies, graded_rest, reference_energy
+from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
 from isp_assets.train.poses import PoseSource, draw_poses, load_clips

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.energy import ClothRest, Fabric
-from isp_assets.train.drape_energy import Contact, drape_energies, face_strain
+from isp_assets.geometry.grading import face_strain
+from isp_assets.train.drape_energy import Contact, drape_energies
 
 if TYPE_CHECKING:
     from isp_assets.train.displacement import DisplacementTask

@@ -23,12 +23,13 @@ from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric
+from isp_assets.geometry.grading import graded_rest
 from isp_assets.geometry.obstacle import Obstacle
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.skinning import shape_garment
-from isp_assets.train.drape_energy import Contact, drape_energies, graded_rest, reference_energy
+from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
 from isp_assets.train.poses import PoseSource, draw_poses, load_clips

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from isp_assets.body import Body
 from isp_assets.geometry.closest import SurfaceTopology
+from isp_assets.geometry.grading import face_strain
 from isp_assets.geometry.intersection import Beneath, measure_intersection
-from isp_assets.train.drape_energy import face_strain
 
 if TYPE_CHECKING:
     from isp_assets.train.layering import Stack

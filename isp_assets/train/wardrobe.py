@@ -15,10 +15,10 @@ from isp_assets.displacement import anchor_ramp, panel_sampler
 from isp_assets.errors import DecodeError, GeometryError, TrainError
 from isp_assets.garment import Garment
 from isp_assets.geometry.energy import ClothRest, Fabric, cloth_rest
+from isp_assets.geometry.grading import face_strain
 from isp_assets.geometry.panel_map import PanelSampler
 from isp_assets.networks.skin_field import SkinField
 from isp_assets.skinning import BoundGarment, bind
-from isp_assets.train.drape_energy import face_strain
 
 _JITTER = 0.15  # of a code, per standard deviation over the category's codes
 _MAX_STRAIN = 0.5  # p99 at rest above which a decoded garment is not fit to learn from

@@ -1,0 +1,44 @@
+"""Draw cloth in from between two body parts: towards its own part, as far as the other one demands.
+
+A sleeve pressed against the torso, or a shirt beneath an arm, may lie deep inside the
+other part, where the shortest way out can lead through it. The way along the line
+to its own part cannot. Positions are in metres. NumPy, one frame at a time.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+_HALVINGS = 5
+
+
+def draw_in(
+    points: Float[np.ndarray, "P 3"],
+    inwards: Float[np.ndarray, "P 3"],
+    room: Float[np.ndarray, " P"],
+    clearance: Callable[[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]], Float[np.ndarray, " n"]],
+) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+    """The shortest moves along ``inwards`` after which nothing is touched.
+
+    Args:
+        points: Points that touch another part [m].
+        inwards: Unit directions to their own part.
+        room: How far each may go [m].
+        clearance: Gives for points, and the rows of ``points`` that they come from, how far they
+            are clear; negative while they touch.
+
+    Returns:
+        The moves [m]; and where they are enough. Where they are not, the moves take all the room:
+        the two parts press the cloth flat.
+    """
+    moves, rows = room[:, None] * inwards, np.arange(len(points))
+    clear = clearance(points + moves, rows) >= 0
+    rows = np.flatnonzero(clear)
+    touching, free = np.zeros(len(rows)), np.ones(len(rows))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (touching + free)
+        enough = clearance(points[rows] + (middle * room[rows])[:, None] * inwards[rows], rows) >= 0
+        free, touching = np.where(enough, middle, free), np.where(enough, touching, middle)
+    moves[rows] = (free * room[rows])[:, None] * inwards[rows]
+    return moves, clear

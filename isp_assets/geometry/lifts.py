@@ -1,0 +1,74 @@
+"""Moves that clear contact, vertex by vertex; and which vertices and faces of an obstacle are near a garment.
+
+Parts of the projection. Positions are in metres. NumPy, one frame at a time.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from isp_assets.geometry.closest import Closest
+from isp_assets.geometry.obstacle import Obstacle
+
+AROUND = 0.015
+"""Vertices this near [m] at the start make the surface around them a neighbour."""
+WATCHED = 0.008
+"""Vertices this near [m] at the start are looked at again in every round."""
+
+_CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
+_MOST_RINGS = 8
+
+
+class Neighbour:
+    """What is known of one obstacle: where the garment comes near it."""
+
+    def __init__(self, obstacle: Obstacle, found: Closest, *, edge: float) -> None:
+        self.obstacle = obstacle
+        topology = obstacle.mesh.topology
+        near = found.height < AROUND
+        close = np.zeros(len(obstacle.vertices), bool)
+        close[topology.faces[found.face[near]]] = True
+        # A garment triangle may span many of the ones beneath: look as far around as it reaches.
+        for _ in range(1 + min(math.ceil(edge / obstacle.mean_edge), _MOST_RINGS)):
+            close[topology.faces[any_corner(close, topology.faces)]] = True
+        self.found: Closest | None = found
+        """What the first query found, until vertices move."""
+        self.watched = found.height < WATCHED
+        self.watched_foreign: Bool[np.ndarray, " V"] | None = None
+        self.vertices = np.flatnonzero(close & ~obstacle.tight)
+        self.faces = np.flatnonzero(any_corner(close, topology.faces))
+        beneath = any_corner(obstacle.tight, topology.faces)[found.face]
+        self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
+
+
+def shortest_way(
+    points: Float[np.ndarray, "P 3"], found: Closest, margin: Float[np.ndarray, " P"], reach: float
+) -> Float[np.ndarray, "P 3"]:
+    """The shortest way from each point to the margin over a surface; none for points that are clear."""
+    touching = (found.height < margin) & (found.height > -reach) & ~found.on_border
+    away = np.where(found.height[:, None] >= 0, points - found.point, found.point - points)
+    length = np.abs(found.height)[:, None]
+    away = np.where(length > 1e-6, away / np.maximum(length, 1e-6), found.normal)
+    return np.where(touching[:, None], (margin - found.height).clip(0, 1)[:, None] * away, 0.0)
+
+
+def towards(points: Float[np.ndarray, "P 3"], found: Closest) -> Float[np.ndarray, "P 3"]:
+    """Unit directions to the closest points; zero beneath the surface and on it."""
+    above = (found.height > 1e-6) & np.isfinite(found.height)
+    length = np.where(above, found.height, 1.0)[:, None]
+    return np.where(above[:, None], (found.point - points) / length, 0.0)
+
+
+def largest_per_vertex(
+    corner: Int[np.ndarray, "n 3"], push: Float[np.ndarray, "n 3 3"], num_vertices: int
+) -> Float[np.ndarray, "V 3"]:
+    vertex, push = corner.reshape(-1), push.reshape(-1, 3)
+    order = np.argsort(np.einsum("vc,vc->v", push, push), kind="stable")
+    largest = np.zeros((num_vertices, 3))
+    largest[vertex[order]] = push[order]  # the last write to a row wins: the longest push
+    return largest
+
+
+def any_corner(mask: Bool[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    return mask[faces[:, 0]] | mask[faces[:, 1]] | mask[faces[:, 2]]
