@@ -1,8 +1,7 @@
-"""Body poses to train on: frames of motions, blended, disturbed, and sometimes with limbs thrown about.
+"""Body poses to train on: frames of motions, blended and disturbed; deliberate poses; any heading and tilt.
 
-Captured motion holds few arms along the torso and few wide steps, and a network
-trained on it alone fails there, so a share of the poses gets large random turns of
-shoulders, elbows, hips and knees.
+Captured motion holds few arms along the torso, few wide steps and no lying bodies, so a
+share of the poses is drawn from `pose_families`, and a share is turned over as a whole.
 """
 
 from collections.abc import Sequence
@@ -14,25 +13,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from isp_assets.conventions import JOINT_NAMES, NUM_JOINTS
+from isp_assets.conventions import NUM_JOINTS
 from isp_assets.errors import TrainError
 from isp_assets.geometry.rotations import slerp
 from isp_assets.motion import Motion, builtin_motions
+from isp_assets.train.pose_families import FAMILIES, draw_family, random_turns
 
 _NOISE = 0.05  # of every joint [rad]
 _LARGEST_BLEND = 0.5
-_SCRAMBLED_SHARE = 0.2
-_SPREAD = {
-    "pelvis": (0.2, 0.0, 0.2), "spine1": (0.12, 0.12, 0.08), "spine2": (0.08, 0.08, 0.06),
-    "spine3": (0.08, 0.08, 0.06), "neck": (0.15, 0.15, 0.1),
-    "left_collar": (0.05, 0.08, 0.12), "right_collar": (0.05, 0.08, 0.12),
-    "left_shoulder": (0.4, 0.45, 0.5), "right_shoulder": (0.4, 0.45, 0.5),
-    "left_elbow": (0.2, 0.5, 0.2), "right_elbow": (0.2, 0.5, 0.2),
-    "left_wrist": (0.4, 0.3, 0.4), "right_wrist": (0.4, 0.3, 0.4),
-    "left_hip": (0.35, 0.15, 0.2), "right_hip": (0.35, 0.15, 0.2),
-    "left_knee": (0.35, 0.05, 0.05), "right_knee": (0.35, 0.05, 0.05),
-}  # fmt: skip
-"""Standard deviation of a thrown-about joint's added turn about its axes [rad]."""
+_FAMILY_SHARE = 0.3  # of the poses
+_TUMBLED_SHARE = 0.1  # of the poses: lying, rolled, upside down
 
 
 @dataclass(frozen=True)
@@ -91,13 +81,25 @@ def draw_poses(
     second[:, 0] = first[:, 0]  # a blend of two headings would lean the body
     poses = slerp(first, second, blend.expand(-1, NUM_JOINTS))
     poses = poses + _NOISE * torch.randn(poses.shape, generator=generator)
-    spread = torch.zeros(NUM_JOINTS, 3)
-    for name, sizes in _SPREAD.items():
-        spread[JOINT_NAMES.index(name)] = torch.tensor(sizes)
-    thrown = (torch.rand(count, 1, 1, generator=generator) < _SCRAMBLED_SHARE).float()
-    poses = poses + thrown * spread * torch.randn(poses.shape, generator=generator)
+    poses = _deliberate(poses, generator)
+    tumbled = torch.rand(count, generator=generator) < _TUMBLED_SHARE
+    poses[:, 0] = torch.where(tumbled[:, None], random_turns(count, generator), poses[:, 0])
     poses[:, -2:] = 0  # hands
     return poses
+
+
+def _deliberate(poses: Float[Tensor, "n 24 3"], generator: torch.Generator) -> Float[Tensor, "n 24 3"]:
+    """Some of the poses carried part or all of the way to a pose of a family."""
+    count = len(poses)
+    chosen = torch.rand(count, generator=generator) < _FAMILY_SHARE
+    which = torch.randint(len(FAMILIES), (count,), generator=generator)
+    share = torch.rand(count, 1, generator=generator).sqrt()  # rather far than near
+    result = poses.clone()
+    for number, family in enumerate(FAMILIES):
+        rows = (chosen & (which == number)).nonzero()[:, 0]
+        goal = draw_family(family, poses[rows], generator)
+        result[rows] = slerp(poses[rows], goal, share[rows].expand(-1, NUM_JOINTS))
+    return result
 
 
 def _frames(clips: Sequence[np.ndarray], count: int, generator: torch.Generator) -> Tensor:

@@ -53,7 +53,7 @@ class WardrobeOptions:
     """How many garments, and how fine."""
 
     garments: int = 60
-    """Training garments; named ones first, then jittered and mixed codes."""
+    """Training garments; every third has a jittered or mixed code."""
     edge_length: float = 0.02
     """Triangle side [m]."""
     map_size: int = 64
@@ -113,12 +113,13 @@ def _rest_strain(sample: WornSample) -> float:
 
 
 def _codes(bundle: GarmentBundle, count: int, rng: np.random.Generator) -> Iterator[Float[np.ndarray, " Z"]]:
-    """Trained codes in random order, then jittered ones and mixtures of two, in turn."""
+    """Trained codes in random order; after every two of them a jittered one or a mixture of two, in turn."""
     codes = np.stack(list(bundle.codes.values()))
     spread = codes.std(axis=0)
-    yield from codes[rng.permutation(len(codes))[:count]]
-    for _ in range(count):
+    trained = iter(codes[rng.permutation(len(codes))])
+    for number in range(count):
         first, second = codes[rng.integers(len(codes), size=2)]
-        yield (first + _JITTER * spread * rng.normal(size=spread.shape)).astype(np.float32)
-        share = rng.uniform(0, 1)
-        yield ((1 - share) * first + share * second).astype(np.float32)
+        share, noise = rng.uniform(0, 1), rng.normal(size=spread.shape)
+        jittered = (first + _JITTER * spread * noise).astype(np.float32)
+        other = jittered if number % 2 else ((1 - share) * first + share * second).astype(np.float32)
+        yield next(trained, other) if number % 3 < 2 else other
