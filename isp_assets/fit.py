@@ -1,9 +1,9 @@
 """Recover the latent code of a garment from a surface: a mesh in the rest pose of its category.
 
 The code alone is optimised, through the differentiable decode of Eq. 5. The panels are
-cut a few times; between cuts the border follows the code to first order, and L-BFGS
-works on a smooth problem. It starts from the mean code and from the garments most like
-the target, and goes on from the best of these.
+cut a few times; between cuts the border follows the code to first order, and Gauss-Newton
+steps with closest points found anew lower the distance. The search starts from the mean
+code and from the garments most like the target, and goes on from the best of these.
 
 Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
 Implicit Sewing Patterns", NeurIPS 2023, Eq. 5 and Section 4.2.
@@ -11,7 +11,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Eq. 5 and Section 4.2.
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,12 +24,13 @@ from isp_assets.collection import Collection
 from isp_assets.decode import RESOLUTIONS
 from isp_assets.errors import DecodeError, GeometryError, MeshError
 from isp_assets.fit_objective import Target
-from isp_assets.fit_search import CodeSpace, FitOptions, Search, SearchState
+from isp_assets.fit_options import CodeSpace, FitOptions
+from isp_assets.fit_search import Search, SearchState
 from isp_assets.garment_clouds import GarmentClouds
 from isp_assets.geometry.surface_distance import Surface, SurfaceDistance, surface_distance
 
 _CHOICE_SAMPLES, _CHOICE_GARMENTS = 600, 50
-_STALLED = 0.995  # a round that leaves more than this of the energy is the last
+_TRIALS = 0.4  # share of the progress when every start was tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +114,10 @@ def choose_bundle(
     return bundles[min(scores, key=scores.__getitem__)]
 
 
+def _within(progress: Callable[[float, str], None], done: float, part: float) -> Callable[[float, str], None]:
+    return lambda share, text: progress(done + share * part, text)
+
+
 class Fitter:
     """Fits codes of one bundle; what no target changes is prepared once.
 
@@ -160,41 +165,50 @@ class Fitter:
         target = Target(place.apply(surface), samples=options.samples)
         # Where a mesh had to be moved, its place is known to a few centimetres only.
         search = Search(self.bundle.model, self._space, target, options, movable=any(place.translation))
-        state = self._best_start(search, progress)
-        for number in range(options.rounds):
-            progress(0.4 + 0.6 * number / options.rounds, f"round {number + 1}, {state.energy:.3g} mm^2 left")
-            following = search.round(state, options.iterations)
-            stalled = following.energy > _STALLED * state.energy
-            if following.energy < state.energy:
-                state = following
-            if stalled:
-                break
-        code = self._space.code(state.position).astype(np.float32)
-        garment = self.bundle.decode(code, resolution=min(2 * options.resolution, RESOLUTIONS[1]))
-        made = Surface(garment.rest_vertices, garment.faces)
-        place = place.moved(-state.shift)
-        distance = surface_distance(made, place.apply(surface), samples=20_000)
-        progress(1.0, f"mean distance {1000 * distance.mean:.2f} mm")
-        return Fit(
-            code, place, distance, state.start, state.energy, search.evaluations,
-            time.perf_counter() - began, made,
-        )  # fmt: skip
+        found = self._starts(search, progress)[: options.finalists]
+        ends: list[Fit] = []
+        faults: list[DecodeError] = []
+        for index, start in enumerate(found):
+            part = (1 - _TRIALS) / len(found)
+            state = search.settle(start, _within(progress, _TRIALS + index * part, part))
+            try:
+                ends.append(self._finish(state, surface, place))
+            except DecodeError as error:
+                faults.append(error)
+        if not ends:
+            raise faults[0]
+        # The energy also weighs normals, borders and the prior: of two ends the closer one is meant.
+        best = min(ends, key=lambda end: end.distance.mean)
+        progress(1.0, f"mean distance {1000 * best.distance.mean:.2f} mm")
+        return replace(best, evaluations=search.evaluations, seconds=time.perf_counter() - began)
 
-    def _best_start(self, search: Search, progress: Callable[[float, str], None]) -> SearchState:
-        codes = list(self.bundle.codes.items())
-        near = self.clouds.nearest(search.target.points, self.options.neighbours)
+    def _finish(self, state: SearchState, surface: Surface, place: Alignment) -> Fit:
+        code = self._space.code(state.position).astype(np.float32)
+        garment = self.bundle.decode(code, resolution=min(2 * self.options.resolution, RESOLUTIONS[1]))
+        made, place = Surface(garment.rest_vertices, garment.faces), place.moved(-state.shift)
+        distance = surface_distance(made, place.apply(surface), samples=20_000)
+        return Fit(code, place, distance, state.start, state.energy, 0, 0.0, made)
+
+    def _starts(self, search: Search, progress: Callable[[float, str], None]) -> list[SearchState]:
+        """Where a few short rounds lead from every start, the best first."""
+        codes, options = list(self.bundle.codes.items()), self.options
+        near = self.clouds.nearest(search.target.points, options.neighbours)
         starts: Mapping[str, np.ndarray] = {codes[k][0]: codes[k][1] for k in near}
         starts = {**starts, "mean": self._space.mean}
         found, faults = [], []
         for index, (name, code) in enumerate(starts.items()):
-            progress(0.4 * index / len(starts), f"from {name}")
+            progress(_TRIALS * index / len(starts), f"from {name}")
+            state = search.begin(code, name)
             try:
-                found.append(search.round(search.begin(code, name), self.options.trial_iterations))
+                for _ in range(options.trial_rounds):
+                    state = search.round(state, options.trial_iterations)
             except DecodeError as error:
                 faults.append(f"{name}: {error}")
+            else:
+                found.append(state)
         if not found:
             raise DecodeError(
                 f"no start of the fit decodes ({'; '.join(faults)}); "
                 f"is the bundle {self.bundle.category!r} trained?"
             )
-        return min(found, key=lambda state: state.energy)
+        return sorted(found, key=lambda state: state.energy)

@@ -42,7 +42,7 @@ class PolygonField(PanelField):
         spans = (a[:, 1] > y) != (b[:, 1] > y)
         crossing = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1] + 1e-30) * (b[:, 0] - a[:, 0])
         inside = (spans & (x < crossing)).sum(1) % 2 == 1
-        return torch.where(inside, -nearest, nearest) - code[0]
+        return torch.where(inside, -nearest, nearest) - code[..., 0]
 
     def forward(self, xy: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         distances = self._distances(xy)
@@ -62,7 +62,7 @@ class DiscField(PanelField):
         self.config = PanelFieldConfig(num_labels=2, code_size=CODE_SIZE)
 
     def signed_distance(self, xy: Tensor, code: Tensor) -> Tensor:
-        return (xy**2).sum(-1).add(1e-16).sqrt() - 0.5 - code[0]
+        return (xy**2).sum(-1).add(1e-16).sqrt() - 0.5 - code[..., 0]
 
     def forward(self, xy: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         y = 50 * xy[:, 1]
@@ -78,7 +78,7 @@ class PillowAtlas(Atlas):
         self.height = height
 
     def forward(self, xy: Tensor, code: Tensor) -> Tensor:
-        return torch.stack([xy[..., 0] + code[1], xy[..., 1], xy[..., 0] * 0 + self.height], dim=-1)
+        return torch.stack([xy[..., 0] + code[..., 1], xy[..., 1], xy[..., 0] * 0 + self.height], dim=-1)
 
 
 def pillow_model(fields: Mapping[str, PanelField], seam_pairs, anchor_labels=()) -> GarmentModel:
