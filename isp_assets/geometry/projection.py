@@ -43,7 +43,7 @@ _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
 _ASIDE = 0.06  # cloth this far [m] outside a part's bounds still has its closest point there
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
-_FINISH_STEP = 0.004  # largest lift [m] of one such correction
+_FINISH_STEP = 0.002  # largest lift [m] of one such correction
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
@@ -142,6 +142,8 @@ class _Projector:
         edge = mean_edge(position, mesh.topology.faces)
         self.near = [Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
+        self.pressed = np.zeros(len(position), bool)
+        """Vertices between two body parts: lifting their triangles off one part drives them into the other."""
         for neighbour in self.near:
             self.tight |= neighbour.cramped
 
@@ -226,6 +228,7 @@ class _Projector:
         size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
         lift *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
         touched &= ~self.mesh.parts
+        self.pressed |= touched.any(1)
         index = np.flatnonzero(touched.any(1) & (room < self.options.reach) & (room > 0) & inwards.any(1))
         if len(index):
             lift[index], _ = draw_in(
@@ -291,7 +294,7 @@ class _Projector:
         pairs = np.stack([mine[pairs[:, 0]], neighbour.faces[pairs[:, 1]]], axis=1)
         above, below = faces[pairs[:, 0]], beneath[pairs[:, 1]]
         own = (self.mesh.parts[above].any(1) & obstacle.mesh.parts[below].any(1)).any(1)
-        trapped = self.tight[above].any(1) | obstacle.tight[below].any(1)
+        trapped = (self.tight | self.pressed)[above].any(1) | obstacle.tight[below].any(1)
         return pairs[own & ~trapped]
 
     def _part(self, obstacle: Obstacle, pairs: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "V 3"]:
