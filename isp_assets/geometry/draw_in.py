@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _HALVINGS = 5
+_STEEPEST = 0.02  # beyond this height [m] the other part is out of sight
 
 
 def draw_in(
@@ -33,12 +34,20 @@ def draw_in(
         the two parts press the cloth flat.
     """
     moves, rows = room[:, None] * inwards, np.arange(len(points))
-    clear = clearance(points + moves, rows) >= 0
+    above = clearance(points + moves, rows)
+    clear = above >= 0
     rows = np.flatnonzero(clear)
+    if len(rows) == 0:
+        return moves, clear
     touching, free = np.zeros(len(rows)), np.ones(len(rows))
+    below, above = clearance(points[rows], rows).clip(max=0), above[rows]
     for _ in range(_HALVINGS):
         middle = 0.5 * (touching + free)
-        enough = clearance(points[rows] + (middle * room[rows])[:, None] * inwards[rows], rows) >= 0
+        found = clearance(points[rows] + (middle * room[rows])[:, None] * inwards[rows], rows)
+        enough = found >= 0
         free, touching = np.where(enough, middle, free), np.where(enough, touching, middle)
-    moves[rows] = (free * room[rows])[:, None] * inwards[rows]
+        above, below = np.where(enough, found, above), np.where(enough, below, found)
+    # Between the last two by a straight line: steps would make the cloth flicker.
+    line = -below / np.maximum(np.minimum(above, _STEEPEST) - below, 1e-12)
+    moves[rows] = ((touching + line.clip(0, 1) * (free - touching)) * room[rows])[:, None] * inwards[rows]
     return moves, clear

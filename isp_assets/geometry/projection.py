@@ -143,7 +143,7 @@ class _Projector:
         self.near = [Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
         self.pressed = np.zeros(len(position), bool)
-        """Vertices between two body parts: lifting their triangles off one part drives them into the other."""
+        """Vertices between two body parts: what lifts them off one drives them into the other."""
         for neighbour in self.near:
             self.tight |= neighbour.cramped
 
@@ -229,12 +229,14 @@ class _Projector:
         lift *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
         touched &= ~self.mesh.parts
         self.pressed |= touched.any(1)
-        index = np.flatnonzero(touched.any(1) & (room < self.options.reach) & (room > 0) & inwards.any(1))
+        index = np.flatnonzero(touched.any(1) & np.isfinite(room) & (room > 0) & inwards.any(1))
         if len(index):
-            lift[index], _ = draw_in(
+            moves, clear = draw_in(
                 self.position[index], inwards[index], room[index],
                 lambda points, rows: self._clearance(points, touched[index[rows]]),
             )  # fmt: skip
+            known = clear | (room[index] < self.options.reach)
+            lift[index[known]] = moves[known]
         return lift
 
     def _foreign_contacts(self, neighbour: Neighbour) -> tuple[Int[np.ndarray, " n"], Closest]:
