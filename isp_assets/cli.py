@@ -80,6 +80,9 @@ def drape(
     write: WriteOption = None,
     device: DeviceOption = Device.auto,
     steps: StepsOption = None,
+    smoothing: Annotated[
+        float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
+    ] = 0.0,
 ) -> None:
     """Drape a shot file and write NAME.usdc, .glb, .rrd, .png and report.json."""
     from dataclasses import replace
@@ -92,7 +95,7 @@ def drape(
         job = ShotJob.load(shot, frames=FrameRange.parse(frames) if frames else None)
     if write is not None:
         job = replace(job, write=split_names(write))
-    options = DrapeOptions(device=_device(device))
+    options = DrapeOptions(device=_device(device), smoothing=smoothing)
     if steps is not None:
         options = replace(options, steps=split_names(steps))
     with _progress() as (bar, task):

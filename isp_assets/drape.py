@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import PosedBody
+from isp_assets.clearing import Calm, clear_layer
 from isp_assets.conventions import FrameRange
 from isp_assets.displacement import displace, displacements
 from isp_assets.drape_features import drape_features
@@ -29,7 +30,7 @@ from isp_assets.errors import DrapeError
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
-from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions, project
+from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.outfit import Outfit
@@ -55,6 +56,9 @@ class DrapeOptions:
     layer_margin: float = LAYER_MARGIN
     """Clearance that projection leaves over an inner garment [m]."""
     projection: ProjectionOptions = field(default_factory=ProjectionOptions)
+    smoothing: float = 0.0
+    """Share of the frame before in what projection moves, 0 to below 1: calms what flickers where cloth
+    is caught between surfaces, for a second, short projection a frame. Frames then depend on those before."""
     keep_stages: bool = False
     """Keep the positions after every rung, to measure what each one did."""
 
@@ -64,6 +68,8 @@ class DrapeOptions:
             raise DrapeError(
                 f"steps must be some of {', '.join(STEPS)}, with skin; got {', '.join(self.steps)}"
             )
+        if not 0 <= self.smoothing < 1:
+            raise DrapeError(f"smoothing must be at least 0 and below 1, got {self.smoothing:g}")
         if self.chunk < 1:
             raise DrapeError(f"chunk must be at least 1 frame, got {self.chunk}")
 
@@ -101,6 +107,7 @@ class _Draper:
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
         self.worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
+        self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
         self.scene = Scene(
             name=shot.name,
@@ -198,7 +205,7 @@ class _Draper:
         tight: list[np.ndarray] | None = None
         if "project" in steps:
             with state.timed("project"):
-                result, tight = self._project(worn, result, state, ran)
+                result, tight = self._clear(index, vertices, posed, state)
         outside = torch.as_tensor(result, device=vertices.device)
         state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
         for t, obstacles in enumerate(state.obstacles):
@@ -207,26 +214,20 @@ class _Draper:
             obstacles.append(Obstacle(worn.collision, result[t], margin=margin, tight=found))
         return result
 
-    def _project(
-        self,
-        worn: WornGarment,
-        vertices: Float[np.ndarray, "T V 3"],
-        state: "_ChunkState",
-        ran: list[list[str]],
+    def _clear(
+        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
     ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray]]:
         """Projected vertices, and per frame which of them have no room."""
-        result, tight = np.empty_like(vertices), []
-        for t, obstacles in enumerate(state.obstacles):
-            if not np.isfinite(vertices[t]).all():
-                raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
-            done = project(
-                vertices[t], worn.collision, obstacles, self.options.projection, stretch=worn.stretch
-            )
-            result[t] = done.vertices
-            tight.append(done.tight)
+        worn, before = self.worn[index], vertices.cpu().numpy()
+        cleared = clear_layer(worn, before, state.obstacles, self.options.projection)
+        for done, ran in zip(cleared, state.steps[index], strict=True):
             if done.ran:
-                ran[t].append("project")
-        return result, tight
+                ran.append("project")
+        result = np.stack([done.vertices for done in cleared])
+        if self.options.smoothing:
+            turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
+            result = self.calm[index].follow(worn, before, cleared, state.obstacles, turns)
+        return result.astype(np.float32), [done.tight for done in cleared]
 
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
         for worn, positions in zip(self.worn, layers, strict=True):

@@ -89,6 +89,8 @@ class Projection:
     """[m]"""
     tight: Bool[np.ndarray, " V"]
     """Vertices where the surfaces beneath leave no room for cloth."""
+    pressed: Bool[np.ndarray, " V"]
+    """Vertices between two body parts."""
     crossings: int
     """Pairs of triangles that still cross, where there is room."""
 
@@ -122,7 +124,7 @@ def project(
     rounds = work.lift()
     crossings = work.finish()
     move = float(np.linalg.norm(work.position - start, axis=1).max(initial=0))
-    return Projection(work.position, move > 0, rounds, move, work.tight, crossings)
+    return Projection(work.position, move > 0, rounds, move, work.tight, work.pressed, crossings)
 
 
 class _Projector:

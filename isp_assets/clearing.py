@@ -1,0 +1,79 @@
+"""Clear a layer of all that lies beneath it, frame by frame; and calm what that does from frame to frame.
+
+Projection knows one frame only. Where cloth is caught between surfaces it may choose
+another way out in the next frame, and a few vertices flicker. Calming lets the moves
+of projection follow those of the frame before, and projects again what that brings
+into contact, except where there is no room: there any place is as good.
+
+Positions are in metres, in world space; NumPy, one frame at a time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from isp_assets.dressing import WornGarment
+from isp_assets.errors import DrapeError
+from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.projection import Projection, ProjectionOptions, project
+
+Obstacles = Sequence[Sequence[Obstacle]]
+"""Per frame, what lies beneath: the body, then every finished layer."""
+
+
+def clear_layer(
+    worn: WornGarment, vertices: Float[np.ndarray, "T V 3"], obstacles: Obstacles, options: ProjectionOptions
+) -> list[Projection]:
+    """Project every frame of a layer.
+
+    Raises:
+        DrapeError: If a position is not finite.
+    """
+    if not np.isfinite(vertices).all():
+        raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
+    return [
+        project(frame, worn.collision, beneath, options, stretch=worn.stretch)
+        for frame, beneath in zip(vertices, obstacles, strict=True)
+    ]
+
+
+@dataclass
+class Calm:
+    """What projection moved in one layer, smoothed over time; carried from frame to frame."""
+
+    share: float
+    """Part that the frame before has in a frame's moves, 0 to below 1."""
+    options: ProjectionOptions
+    moved: Float[np.ndarray, "V 3"] | None = None
+    """Of the last frame, in the pelvis's frame [m]."""
+
+    def follow(
+        self,
+        worn: WornGarment,
+        before: Float[np.ndarray, "T V 3"],
+        cleared: list[Projection],
+        obstacles: Obstacles,
+        world_from_pelvis: Float[np.ndarray, "T 3 3"],
+    ) -> Float[np.ndarray, "T V 3"]:
+        """Calmed positions of the next frames [m].
+
+        Args:
+            worn: The layer.
+            before: Its positions before projection [m].
+            cleared: Its projections.
+            obstacles: What lies beneath.
+            world_from_pelvis: The pelvis's rotation, with which the moves turn.
+        """
+        short = replace(self.options, rounds=2, ease=0)
+        result = np.empty(before.shape)
+        for t, (done, turn) in enumerate(zip(cleared, world_from_pelvis, strict=True)):
+            moved = (done.vertices - before[t]) @ turn
+            if self.moved is not None:
+                moved = self.share * self.moved + (1 - self.share) * moved
+            self.moved = moved
+            calmed = before[t] + moved @ turn.T
+            clear = project(calmed, worn.collision, obstacles[t], short).vertices
+            result[t] = np.where((done.tight | done.pressed)[:, None], calmed, clear)
+        return result
