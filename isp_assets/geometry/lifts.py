@@ -43,7 +43,10 @@ class Neighbour:
 
 
 def shortest_way(
-    points: Float[np.ndarray, "P 3"], found: Closest, margin: Float[np.ndarray, " P"], reach: float
+    points: Float[np.ndarray, "P 3"],
+    found: Closest,
+    margin: Float[np.ndarray, " P"],
+    reach: Float[np.ndarray, " P"],
 ) -> Float[np.ndarray, "P 3"]:
     """The shortest way from each point to the margin over a surface; none for points that are clear."""
     touching = (found.height < margin) & (found.height > -reach) & ~found.on_border

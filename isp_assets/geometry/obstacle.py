@@ -165,6 +165,11 @@ class Obstacle:
         """Parts that each face belongs to."""
         return self.mesh.parts[self.mesh.topology.faces[face]].any(1)
 
+    def border_rings_at(self, found: Closest) -> Float[np.ndarray, " P"]:
+        """Edges between closest points and the open border, counted up to 4."""
+        rings = self.mesh.border_rings[self.mesh.topology.faces[found.face]]
+        return np.einsum("pk,pk->p", rings, found.weights)
+
     def contacts(
         self, points: Float[np.ndarray, "P 3"], parts: Bool[np.ndarray, "P 6"], *, within: float
     ) -> Closest:

@@ -23,6 +23,7 @@ from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.draw_in import draw_in
 from isp_assets.geometry.lifts import (
+    AROUND,
     WATCHED,
     Neighbour,
     any_corner,
@@ -40,11 +41,13 @@ LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
-_ASIDE = 0.06  # cloth this far [m] outside a part's bounds still has its closest point there
+_ASIDE = 0.06  # cloth this far [m] outside the bounds of a part of the body still has its closest point there
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _FINISH_STEP = 0.002  # largest lift [m] of one such correction
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
+_RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
+_RIM_REACH = 0.015  # contact deeper than this [m] is left alone there
 _PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
 
@@ -140,7 +143,11 @@ class _Projector:
     ) -> None:
         self.start = self.position = position
         self.mesh, self.options, self.stretch = mesh, options, stretch
-        first = [o.contacts(position, mesh.parts, within=_ASIDE) for o in obstacles]
+        aside = [_ASIDE] + [AROUND] * (len(obstacles) - 1)
+        first = [
+            o.contacts(position, mesh.parts, within=within)
+            for o, within in zip(obstacles, aside, strict=True)
+        ]
         edge = mean_edge(position, mesh.topology.faces)
         self.near = [Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
         self.tight = np.zeros(len(position), bool)
@@ -200,12 +207,14 @@ class _Projector:
         for neighbour in self.near:
             obstacle, index, found = neighbour.obstacle, np.flatnonzero(neighbour.watched), neighbour.found
             if found is None:
-                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=_ASIDE)
+                within = _ASIDE if neighbour is self.near[0] else AROUND
+                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=within)
             else:
                 index = np.arange(len(self.position))
             points = self.position[index]
             margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
-            keep_larger(own, shortest_way(points, found, margin, self.options.reach), index)
+            reach = np.where(obstacle.border_rings_at(found) < _RIM, _RIM_REACH, self.options.reach)
+            keep_larger(own, shortest_way(points, found, margin, reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
             if neighbour is self.near[0]:
@@ -225,7 +234,8 @@ class _Projector:
             margin = np.full(len(index), neighbour.obstacle.margin)
             touching = found.height < margin
             touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
-            way = shortest_way(self.position[index], found, margin, self.options.foreign_reach)
+            reach = np.full(len(index), self.options.foreign_reach)
+            way = shortest_way(self.position[index], found, margin, reach)
             keep_larger(lift, way, index)
         size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
         lift *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]

@@ -80,8 +80,7 @@ def _firmness(
     It is sure inside the cover's border, where both cloths face the same way and the cover
     lies straight inwards. In the folds of an armpit none of this holds.
     """
-    rings = cover.mesh.border_rings[cover.mesh.topology.faces[found.face]]
-    inside = np.einsum("vk,vk->v", rings, found.weights) / _BORDER_RINGS
+    inside = cover.border_rings_at(found) / _BORDER_RINGS
     alike = np.einsum("vc,vc->v", normals, found.normal)
     inwards = -np.einsum("vc,vc->v", normals, towards)
     low, high = _SURE
