@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology, signed_heights
+from isp_assets.geometry.closest import ClosestQuery, SurfacePart, SurfaceTopology, signed_heights
 
 
 def _query(mesh: trimesh.Trimesh) -> ClosestQuery:
@@ -103,3 +103,25 @@ def test_bad_positions_are_refused() -> None:
 
 def test_no_points_give_no_answers() -> None:
     assert len(_query(trimesh.creation.box())(np.zeros((0, 3))).height) == 0
+
+
+def test_a_part_knows_where_it_was_cut_out() -> None:
+    """Half of a ball: above its inside the closest point lies on the cut, where no side is known."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
+    topology = SurfaceTopology.build(faces, len(vertices))
+    lower = np.flatnonzero(vertices[faces].mean(1)[:, 1] < 0)
+    query = ClosestQuery(vertices, topology, part=SurfacePart.build(topology, lower))
+    found = query(np.array([[0.0, 0.06, 0.0], [0.0, -0.15, 0.0], [0.0, -0.06, 0.0], [0.13, 0.04, 0.0]]))
+    assert found.on_cut.tolist() == [True, False, False, True]
+    assert not found.on_border.any()
+    np.testing.assert_allclose(found.height[1:3], [0.05, -0.04], atol=2e-3)
+
+
+def test_the_whole_surface_has_no_cut() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    faces = np.asarray(mesh.faces, np.int64)
+    topology = SurfaceTopology.build(faces, len(mesh.vertices))
+    whole = SurfacePart.build(topology, np.arange(len(faces)))
+    assert not whole.cut_edge.any()
+    assert not whole.cut_vertex.any()

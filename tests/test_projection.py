@@ -80,6 +80,16 @@ def test_a_long_garment_is_not_lifted_beyond_the_border_of_a_short_one() -> None
     assert moved[outer[0][:, 1] < -0.32].max() < 1e-3
 
 
+def test_cloth_that_hangs_above_the_rim_of_an_inner_garment_is_not_pulled_into_it() -> None:
+    """A funnel that opens upwards: what hangs above its mouth lies on the inner side of its slope."""
+    funnel, faces = tube(0.1, low=-0.3, high=0.0)
+    funnel[:, [0, 2]] *= 1 + 2.5 * (funnel[:, 1:2] + 0.3)  # wider towards the top
+    hanging = tube(0.13, low=-0.03, high=0.25)
+    below = obstacle((funnel, faces), margin=0.0025)
+    done = project(hanging[0], collision(hanging), [obstacle(ball(0.05)), below])
+    assert done.largest_move < 0.03
+
+
 def test_contact_deep_inside_another_body_part_is_left_alone() -> None:
     """A sleeve within the torso is not the torso's: pushing it through would tear it off its arm."""
     cloth = tube(0.02, low=-0.02, high=0.02)

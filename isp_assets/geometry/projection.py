@@ -13,18 +13,16 @@ time; obstacles (`Obstacle`) are the body and the finished inner garments.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
+from isp_assets.geometry.closest import ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
-from isp_assets.geometry.draw_in import draw_in
 from isp_assets.geometry.lifts import (
     AROUND,
-    WATCHED,
     Neighbour,
     any_corner,
     largest_per_vertex,
@@ -32,6 +30,7 @@ from isp_assets.geometry.lifts import (
     towards,
 )
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
+from isp_assets.geometry.other_parts import Ways, leave_other_parts
 from isp_assets.geometry.spread import keep_larger, spread
 from isp_assets.geometry.stretch import StretchLimit
 
@@ -221,57 +220,10 @@ class _Projector:
                 inwards[index] = towards(points, found)
         if not foreign:
             return own
-        other = self._leave_other_parts(inwards, room)
+        ways = Ways(inwards, room, self.options.reach, self.options.foreign_reach)
+        other, pressed = leave_other_parts(self.position, self.mesh.parts, self.near, ways)
+        self.pressed |= pressed
         return np.where((own != 0).any(1, keepdims=True), own, other)
-
-    def _leave_other_parts(
-        self, inwards: Float[np.ndarray, "V 3"], room: Float[np.ndarray, " V"]
-    ) -> Float[np.ndarray, "V 3"]:
-        """Draw in what touches another part; where there is no room for that, lift it by what there is."""
-        lift, touched = np.zeros_like(self.position), np.zeros_like(self.mesh.parts)
-        for neighbour in self.near:
-            index, found = self._foreign_contacts(neighbour)
-            margin = np.full(len(index), neighbour.obstacle.margin)
-            touching = found.height < margin
-            touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
-            reach = np.full(len(index), self.options.foreign_reach)
-            way = shortest_way(self.position[index], found, margin, reach)
-            keep_larger(lift, way, index)
-        size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
-        lift *= np.minimum(1, room / np.maximum(size, 1e-9))[:, None]
-        touched &= ~self.mesh.parts
-        self.pressed |= touched.any(1)
-        index = np.flatnonzero(touched.any(1) & np.isfinite(room) & (room > 0) & inwards.any(1))
-        if len(index):
-            moves, clear = draw_in(
-                self.position[index], inwards[index], room[index],
-                lambda points, rows: self._clearance(points, touched[index[rows]]),
-            )  # fmt: skip
-            known = clear | (room[index] < self.options.reach)
-            lift[index[known]] = moves[known]
-        return lift
-
-    def _foreign_contacts(self, neighbour: Neighbour) -> tuple[Int[np.ndarray, " n"], Closest]:
-        watched = neighbour.watched_foreign
-        index = np.arange(len(self.position)) if watched is None else np.flatnonzero(watched)
-        margin = neighbour.obstacle.margin
-        found = _sure(
-            neighbour.obstacle.contacts(self.position[index], ~self.mesh.parts[index], within=margin)
-        )
-        if watched is None:
-            neighbour.watched_foreign = found.height < WATCHED
-        return index, found
-
-    def _clearance(
-        self, points: Float[np.ndarray, "n 3"], parts: Bool[np.ndarray, "n 6"]
-    ) -> Float[np.ndarray, " n"]:
-        """How far points are above the margins over some parts [m]; negative where they touch."""
-        least = np.full(len(points), np.inf)
-        for neighbour in self.near:
-            margin = neighbour.obstacle.margin
-            found = _sure(neighbour.obstacle.contacts(points, parts, within=margin))
-            least = np.minimum(least, found.height - margin)
-        return least
 
     def _lift_triangles(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
         """Lift the corners of triangles over obstacle vertices that poke through them."""
@@ -323,8 +275,3 @@ class _Projector:
         need = (top[:, None] + _CLEAR - height).clip(0, _FINISH_STEP)
         push = need[..., None] * plane[:, None] * (alike > -_SAME_SIDE)[:, None, None]
         return largest_per_vertex(faces, push, len(self.position))
-
-
-def _sure(found: Closest) -> Closest:
-    """The same, with infinite heights where the closest point lies on a border and no side is known."""
-    return replace(found, height=np.where(found.on_border | found.on_cut, np.inf, found.height))
