@@ -122,18 +122,6 @@ def test_wrong_options_and_body(outfit: Outfit, shot: Shot) -> None:
         drape(outfit, other)
 
 
-def test_smoothing_is_the_same_in_any_chunks_and_leaves_the_first_frame(outfit: Outfit, shot: Shot) -> None:
-    options = replace(QUICK, steps=("skin", "project"), smoothing=0.5)
-    whole = positions(outfit, shot, replace(options, chunk=16))
-    parts = positions(outfit, shot, replace(options, chunk=2))
-    for a, b in zip(whole, parts, strict=True):
-        # Another batch size rounds otherwise, and where cloth is caught projection enlarges that.
-        assert np.abs(a - b).mean() < 1e-4
-    plain = positions(outfit, shot, replace(options, smoothing=0.0))
-    assert np.linalg.norm(whole[0][0] - plain[0][0], axis=-1).max() < 0.006
-    assert np.linalg.norm(whole[0][1:] - plain[0][1:], axis=-1).max() > 1e-4
-
-
 def test_smoothing_lowers_the_jerk_that_projection_adds(outfit: Outfit, shot: Shot) -> None:
     def jerk(smoothing: float) -> float:
         layers = positions(outfit, shot, replace(QUICK, smoothing=smoothing))

@@ -1,0 +1,92 @@
+"""Calming over time: exact in any pieces, nothing in the first frame, a fixed point where nothing moves."""
+
+import numpy as np
+import pytest
+import torch
+
+from isp_assets.body import Body
+from isp_assets.clearing import Calm, clear_layer
+from isp_assets.collection import Collection
+from isp_assets.dressing import WornGarment, dress
+from isp_assets.errors import DrapeError
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
+from isp_assets.geometry.projection import Projection, ProjectionOptions
+from isp_assets.motion import Motion
+from isp_assets.skinning import skin_garment
+
+OPTIONS = ProjectionOptions()
+FRAMES = 4
+
+
+class Scene:
+    """A tee, skinned and not yet projected, on a few frames of the walk."""
+
+    def __init__(self) -> None:
+        body, betas = Body.load("default"), torch.zeros(10)
+        self.worn: WornGarment = dress(Collection.load().outfit(["tee"]), body, betas, resolution=40)[0]
+        motion = Motion.load("walk")
+        posed = body.pose(torch.as_tensor(motion.poses[40 : 40 + FRAMES], dtype=torch.float32))
+        self.before = skin_garment(self.worn.skin, posed, betas)[0].numpy()
+        mesh = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
+        self.obstacles = [[Obstacle(mesh, v, margin=0.003)] for v in posed.vertices.numpy()]
+        self.turns = posed.joint_transforms[:, 0, :3, :3].numpy()
+        self.cleared = clear_layer(self.worn, self.before, self.obstacles, OPTIONS)
+
+    def calm(self, calm: Calm, rows: slice) -> np.ndarray:
+        return calm.follow(
+            self.worn, self.before[rows], self.cleared[rows], self.obstacles[rows], self.turns[rows]
+        )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene()
+
+
+def test_pieces_give_what_the_whole_gives(scene: Scene) -> None:
+    whole = scene.calm(Calm(0.5, OPTIONS), slice(None))
+    calm = Calm(0.5, OPTIONS)
+    parts = [scene.calm(calm, slice(k, k + 2)) for k in range(0, FRAMES, 2)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_the_first_frame_has_nothing_to_follow(scene: Scene) -> None:
+    first = scene.calm(Calm(0.5, OPTIONS), slice(0, 1))[0]
+    done = scene.cleared[0]
+    caught = done.tight | done.pressed
+    assert caught.any()
+    np.testing.assert_allclose(first[caught], done.vertices[caught], atol=1e-6)
+    later = scene.calm(Calm(0.5, OPTIONS), slice(None))[-1]
+    assert np.abs(later - scene.cleared[-1].vertices).max() > 1e-4
+
+
+def test_moves_that_stay_the_same_are_kept(scene: Scene) -> None:
+    """The same frame again and again, the body turning: the moves turn with it and do not decay."""
+    calm = Calm(0.75, OPTIONS)
+    same = [scene.calm(calm, slice(0, 1))[0] for _ in range(3)]
+    caught = scene.cleared[0].tight | scene.cleared[0].pressed
+    np.testing.assert_allclose(same[2][caught], same[0][caught], atol=1e-6)
+    assert calm.moved is not None
+    moved = (scene.cleared[0].vertices - scene.before[0]) @ scene.turns[0]
+    np.testing.assert_allclose(calm.moved, moved, atol=1e-6)
+
+
+def test_moves_follow_exponentially(scene: Scene) -> None:
+    """After frames whose projection moves nothing, each keeps the share of the one before."""
+    calm = Calm(0.5, OPTIONS)
+    scene.calm(calm, slice(0, 1))
+    start = calm.moved
+    assert start is not None
+    still = [
+        Projection(v, False, 0, 0.0, done.tight, done.pressed, 0)
+        for v, done in zip(scene.before, scene.cleared, strict=True)
+    ]
+    calm.follow(scene.worn, scene.before[:2], still[:2], scene.obstacles[:2], scene.turns[:2])
+    np.testing.assert_allclose(calm.moved, 0.25 * start, atol=1e-7)
+
+
+def test_positions_that_are_not_finite_are_refused(scene: Scene) -> None:
+    broken = scene.before.copy()
+    broken[1, 5] = np.nan
+    with pytest.raises(DrapeError, match="L00_tee: positions are not finite"):
+        clear_layer(scene.worn, broken, scene.obstacles, OPTIONS)
