@@ -61,15 +61,16 @@ def dress(
         DrapeError: If the skin field does not fit the body.
     """
     return tuple(
-        _wear(outfit, index, item, body, betas, resolution=resolution, device=device)
-        for index, item in enumerate(outfit)
+        _wear(outfit, index, body, betas, resolution=resolution, device=device)
+        for index in range(len(outfit))
     )
 
 
 @torch.no_grad()
 def _wear(
-    outfit: Outfit, index: int, item: OutfitItem, body: Body, betas: Tensor, *, resolution: int, device: str
+    outfit: Outfit, index: int, body: Body, betas: Tensor, *, resolution: int, device: str
 ) -> WornGarment:
+    item = outfit.items[index]
     garment = decode_garment(item.bundle.model, item.code, resolution=resolution, name=item.name)
     skin = bind(garment, body, outfit.skin.skin_field.to(device))
     flat = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, Fabric())

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import Result
+from hanging_cloth import hanging_square
 from typer.testing import CliRunner
 
 from isp_assets.cli import app
@@ -22,7 +23,6 @@ from isp_assets.evaluate.physics_energy import EnergyReference
 from isp_assets.frames import DrapedFrames, FrameChunk, StageTimes
 from isp_assets.geometry.energy import Fabric, cloth_rest
 from isp_assets.physics import (
-    Cloth,
     HoldResult,
     PhysicsResult,
     PhysicsScene,
@@ -165,7 +165,8 @@ def test_frames_without_stages_are_refused(shot: SyntheticShot) -> None:
 
 def test_energy_reference_lets_a_square_hang() -> None:
     """Pinned along its top edge, the middle of the hem sinks as far as a bar of the same stiffness does."""
-    cloth, scene = _hanging_square()
+    scene = hanging_square(8)
+    cloth = scene.cloths[0]
     result = EnergyReference(iterations=2000).drape(scene)
     found = result.states["minimum"][0][0]
     fabric, length = scene.fabric, 0.5
@@ -192,7 +193,8 @@ def test_unknown_solver_is_named() -> None:
 
 
 def test_scene_checks_its_frames() -> None:
-    cloth, scene = _hanging_square()
+    scene = hanging_square(8)
+    cloth = scene.cloths[0]
     with pytest.raises(PluginError, match="positions for 2 frames"):
         replace(scene, cloths=(replace(cloth, start=np.repeat(cloth.start, 2, axis=0)),))
     with pytest.raises(PluginError, match="needs a garment"):
@@ -215,17 +217,3 @@ def test_command_writes_tables(tmp_path) -> None:
     rows = json.loads((tmp_path / "physics.json").read_text())["rows"]
     assert {row["outfit"] for row in rows} == {"shorts"}
     assert [row["state"] for row in rows][-1] == "energy minimum"
-
-
-def _hanging_square(size: int = 8) -> tuple[Cloth, PhysicsScene]:
-    """A flat square of half a metre in the plane z = 0, held along its top edge; the body is far away."""
-    x, y = np.meshgrid(*[np.linspace(0, 0.5, size)] * 2)
-    flat = np.stack([x, y], -1).reshape(-1, 2)
-    grid = np.arange(size**2).reshape(size, size)
-    quad = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], -1).reshape(-1, 4)
-    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
-    start = np.c_[flat, np.zeros(len(flat))][None]
-    cloth = Cloth("square", faces, flat[faces], start, grid[-1])
-    body = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) + (0, -9, 0)
-    body_faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    return cloth, PhysicsScene((cloth,), body_faces, body[None])

@@ -9,9 +9,10 @@ from jaxtyping import Int
 from isp_assets.conventions import JOINT_NAMES
 from isp_assets.evaluate.criteria import CRITERIA
 from isp_assets.evaluate.frames import FINAL
-from isp_assets.evaluate.trained_range import TRAINED_BETA, joint_angles, trained_angles
+from isp_assets.evaluate.trained_range import joint_angles, trained_angles
 from isp_assets.frames import Layer
 from isp_assets.shot import Shot
+from isp_assets.train.poses import BETA_RANGE
 
 
 def job_warnings(
@@ -61,9 +62,9 @@ def _value(row: Mapping[str, Any], layer: Layer, figure: str) -> float:
 
 
 def _betas(shot: Shot) -> list[dict[str, Any]]:
-    beyond = np.flatnonzero(np.abs(shot.betas) > TRAINED_BETA)
+    beyond = np.flatnonzero(np.abs(shot.betas) > BETA_RANGE)
     return [
-        _warning("shape", f"beta {k} beyond training", np.abs(shot.betas[[k]]), TRAINED_BETA) for k in beyond
+        _warning("shape", f"beta {k} beyond training", np.abs(shot.betas[[k]]), BETA_RANGE) for k in beyond
     ]
 
 

@@ -22,7 +22,7 @@ from isp_assets.decode import decode_with_report
 from isp_assets.errors import DatasetError, GeometryError, InputError, IspAssetsError, PluginError
 from isp_assets.evaluate.memory import PeakMemory
 from isp_assets.fit import Fitter
-from isp_assets.fit_search import FitOptions
+from isp_assets.fit_options import FitOptions
 from isp_assets.geometry.surface_distance import Surface, surface_distance
 from isp_assets.train.dataset import GarmentDataset, TrainingGarment
 

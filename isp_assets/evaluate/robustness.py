@@ -17,7 +17,7 @@ from jaxtyping import Float
 from isp_assets.bundle import GarmentBundle
 from isp_assets.decode import decode_with_report
 from isp_assets.errors import BundleError, DecodeError, GeometryError, InputError
-from isp_assets.fit_search import CodeSpace
+from isp_assets.fit_options import CodeSpace
 from isp_assets.garment import Garment
 from isp_assets.geometry.folds import folded_faces
 from isp_assets.geometry.topology import boundary_loops, hinges

@@ -10,9 +10,6 @@ from isp_assets.conventions import JOINT_NAMES
 from isp_assets.geometry.rotations import axis_angle_to_matrix
 from isp_assets.train.poses import PoseSource, draw_poses, load_clips
 
-TRAINED_BETA = 2.0
-"""Shape coefficients in training lie within this of 0."""
-
 _NO_CLOTH = ("head", "left_foot", "right_foot", "left_hand", "right_hand")
 _DRAWN = 8000
 _KEPT = 0.999
@@ -30,8 +27,9 @@ def joint_angles(poses: Float[np.ndarray, "T 24 3"]) -> Float[np.ndarray, "T 24"
 def trained_angles() -> Float[np.ndarray, " 24"]:
     """Angle of every joint that 99.9 % of training poses stay below [degrees].
 
-    Of poses drawn as training draws them, from the built-in motions. Networks that saw further
-    motions know a little more than that. Joints that move no cloth have no limit.
+    Of poses drawn as training draws them today, from the built-in motions. Networks that saw further
+    motions know a little more than that, networks that were trained before less: of the built-in
+    ones, only the skirts' have seen the deliberate poses. Joints that move no cloth have no limit.
     """
     clips = load_clips(PoseSource())
     poses = draw_poses(list(clips.train.values()), _DRAWN, torch.Generator().manual_seed(0))

@@ -31,10 +31,9 @@ from isp_assets.skinning import shape_garment, skin_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
-from isp_assets.train.poses import PoseSource, draw_poses, load_clips
+from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
 from isp_assets.train.wardrobe import WardrobeOptions, WornSample, build_wardrobe
 
-_BETA_RANGE = 2.0
 _QUICK_GARMENTS, _TEST_FRAMES = 3, 8
 
 
@@ -108,7 +107,7 @@ class DisplacementTask:
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
         """The terms of Eq. 8 on a scale on which hard poses do not drown the others."""
         poses = draw_poses(list(self.clips.train.values()), self.options.frames, generator)
-        betas = _BETA_RANGE * (2 * torch.rand(self.module.config.num_betas, generator=generator) - 1)
+        betas = BETA_RANGE * (2 * torch.rand(self.module.config.num_betas, generator=generator) - 1)
         batch = self.pose(poses, betas)
         maps = self.module.maps()
         chosen = torch.randint(len(self.wardrobe), (self.options.garments,), generator=generator)
@@ -190,7 +189,7 @@ class DisplacementTask:
         count = self.module.config.num_betas
         generator = torch.Generator().manual_seed(1)
         shapes = [torch.zeros(count)]
-        shapes += [_BETA_RANGE * (2 * torch.rand(count, generator=generator) - 1) for _ in range(2)]
+        shapes += [BETA_RANGE * (2 * torch.rand(count, generator=generator) - 1) for _ in range(2)]
         rows = np.linspace(0, len(frames) - 1, len(shapes) * _TEST_FRAMES).astype(int)
         return [
             (torch.tensor(frames[rows[k :: len(shapes)]], dtype=torch.float32), betas)

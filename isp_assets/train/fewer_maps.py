@@ -17,11 +17,10 @@ from isp_assets.bundle import GarmentBundle
 from isp_assets.drape_features import drape_features
 from isp_assets.errors import TrainError
 from isp_assets.networks.drape_field import DrapeField
-from isp_assets.train.poses import PoseSource, draw_poses, load_clips
+from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
 
 _POSES = 40  # a garment
 _GARMENTS = 50
-_BETA_RANGE = 2.0
 
 
 def keep_fewer_maps(bundle: GarmentBundle, count: int, *, seed: int = 0) -> tuple[GarmentBundle, float]:
@@ -53,7 +52,7 @@ def usual_coefficients(bundle: GarmentBundle, field: DrapeField, *, seed: int) -
     codes = torch.stack([torch.from_numpy(code).float() for code in bundle.codes.values()])
     rows = []
     for index in torch.linspace(0, len(codes) - 1, min(_GARMENTS, len(codes))).long().tolist():
-        betas = _BETA_RANGE * (2 * torch.rand(field.config.num_betas, generator=generator) - 1)
+        betas = BETA_RANGE * (2 * torch.rand(field.config.num_betas, generator=generator) - 1)
         posed = body.pose(draw_poses(clips, _POSES, generator), betas=betas)
         features = drape_features(posed, betas, codes[index], num_betas=field.config.num_betas)
         rows.append(field.coefficients(features))

@@ -32,11 +32,10 @@ from isp_assets.skinning import shape_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
-from isp_assets.train.poses import PoseSource, draw_poses, load_clips
+from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
 from isp_assets.train.wardrobe import WardrobeOptions
 from isp_assets.train.wearers import Wearer, build_wearers
 
-_BETA_RANGE = 2.0
 LAYER_REACH = 0.05
 """Samples of an inner garment further than this [m] do not touch."""
 
@@ -174,7 +173,7 @@ class LayeringTask:
 
     def _betas(self, generator: torch.Generator) -> Float[Tensor, " B"]:
         count = self.body.shape_dirs.shape[-1]
-        return _BETA_RANGE * (2 * torch.rand(count, generator=generator) - 1)
+        return BETA_RANGE * (2 * torch.rand(count, generator=generator) - 1)
 
     @torch.no_grad()
     def measure(self) -> dict[str, float]:

@@ -19,6 +19,9 @@ from isp_assets.geometry.rotations import slerp
 from isp_assets.motion import Motion, builtin_motions
 from isp_assets.train.pose_families import FAMILIES, draw_family, random_turns
 
+BETA_RANGE = 2.0
+"""Shape coefficients in training lie within this of 0."""
+
 _NOISE = 0.05  # of every joint [rad]
 _LARGEST_BLEND = 0.5
 _FAMILY_SHARE = 0.3  # of the poses

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from hanging_cloth import hanging_square
 from scipy.spatial import ConvexHull
 
 from isp_assets.errors import MissingExtraError, PluginError
@@ -19,19 +20,6 @@ from isp_assets_plugins.newton.simulation import Simulation, _wound_alike
 needs_newton = pytest.mark.skipif(
     find_spec("newton") is None, reason="needs the extra: pip install 'isp-assets[newton]'"
 )
-
-
-def _square(size: int = 9) -> PhysicsScene:
-    """A flat square of half a metre in the plane z = 0, held along its top edge; the body is far away."""
-    x, y = np.meshgrid(*[np.linspace(0, 0.5, size)] * 2)
-    flat = np.stack([x, y], -1).reshape(-1, 2)
-    grid = np.arange(size**2).reshape(size, size)
-    quad = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], -1).reshape(-1, 4)
-    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
-    start = np.c_[flat, np.zeros(len(flat))][None]
-    cloth = Cloth("square", faces, flat[faces], start, grid[-1])
-    body = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) + (0, -9, 0)
-    return PhysicsScene((cloth,), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), body[None])
 
 
 def _moved(scene: PhysicsScene, path: np.ndarray) -> PhysicsScene:
@@ -79,7 +67,7 @@ def test_entry_point_gives_the_solver() -> None:
 @needs_newton
 def test_square_hangs_as_far_as_a_bar_of_its_stiffness() -> None:
     """The hem sinks by ``density g L^2 / 2E``; gravity pulls along one axis of the panel."""
-    scene = _square()
+    scene = hanging_square(9)
     solver = NewtonSolver(NewtonOptions(first_settle=500, still=1e-5))
     found = solver.drape(scene).states["settled"][0][0]
     start, fabric = scene.cloths[0].start[0], scene.fabric
@@ -92,7 +80,7 @@ def test_square_hangs_as_far_as_a_bar_of_its_stiffness() -> None:
 
 @needs_newton
 def test_flat_square_rests_without_gravity() -> None:
-    scene = _square()
+    scene = hanging_square(9)
     result = NewtonSolver(NewtonOptions(gravity=0.0, first_settle=20)).drape(scene)
     np.testing.assert_allclose(result.states["settled"][0], scene.cloths[0].start, atol=1e-6)
     held = NewtonSolver(NewtonOptions(gravity=0.0)).hold(scene, 0, (scene.cloths[0].start[0],), 5)
@@ -103,7 +91,7 @@ def test_flat_square_rests_without_gravity() -> None:
 @needs_newton
 def test_first_step_from_rest_falls_freely() -> None:
     """Slack cloth gains ``g dt`` in a step; the solver takes .2 % of every speed away."""
-    scene = _square()
+    scene = hanging_square(9)
     free = replace(scene.cloths[0], held=np.zeros(0, np.int64))
     scene = replace(scene, cloths=(free,))
     held = NewtonSolver(NewtonOptions(substeps=8)).hold(scene, 0, (free.start[0],), 1)
@@ -115,20 +103,22 @@ def test_held_vertices_follow_and_travel_changes_nothing() -> None:
     """A scene that accelerates sideways gives the drape of the one that stands, carried along."""
     path = np.array([[0, 0, 0], [0.05, 0, 0.02], [0.2, 0, 0.1]])
     solver = NewtonSolver(NewtonOptions(first_settle=30, settle=10, substeps=2))
-    still = solver.drape(_moved(_square(), np.zeros_like(path)))
-    moved = solver.drape(_moved(_square(), path))
+    still = solver.drape(_moved(hanging_square(9), np.zeros_like(path)))
+    moved = solver.drape(_moved(hanging_square(9), path))
     for state in ("moving", "settled"):
         np.testing.assert_allclose(moved.states[state][0], still.states[state][0] + path[:, None], atol=1e-4)
-    top = _square().cloths[0].held
+    top = hanging_square(9).cloths[0].held
     np.testing.assert_allclose(
-        moved.states["moving"][0][:, top], _square().cloths[0].start[:, top] + path[:, None], atol=1e-6
+        moved.states["moving"][0][:, top],
+        hanging_square(9).cloths[0].start[:, top] + path[:, None],
+        atol=1e-6,
     )
 
 
 @needs_newton
 def test_skin_that_slides_drags_the_cloth_along() -> None:
     """Cloth on a slab: friction speeds it up towards the slab's velocity, and never beyond."""
-    square = _square()
+    square = hanging_square(9)
     flat = square.cloths[0].start[:, :, [0, 2, 1]] * (1, 1, -1) + (0, 0.0045, 0)
     x, y, z = np.meshgrid([-1.0, 1.5], [-1.0, 0.0], [-1.5, 1.0], indexing="ij")
     slab = np.stack([x, y, z], -1).reshape(-1, 3)
