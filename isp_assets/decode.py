@@ -10,6 +10,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Eqs. 1, 3 and 5.
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from isp_assets.errors import DecodeError, GarmentError, GeometryError
 from isp_assets.garment import Garment, Panel, Seam
 from isp_assets.garment_model import GarmentModel
 from isp_assets.geometry.edge_runs import EdgeRun, split_edges
+from isp_assets.geometry.lattice_interpolation import LatticeInterpolation
 from isp_assets.geometry.outline import PlaneField, trace_outline
 from isp_assets.geometry.sewing import FlatPanel, SewnPanels, sew_panels
 from isp_assets.networks.panel_field import PanelField
@@ -29,6 +31,10 @@ RESOLUTIONS = (32, 512)
 """Coarsest and finest mesh: grid cells across a panel's square."""
 _OUTLINE_CELLS = 256
 """Outlines are found on a grid at least this fine, so coarse and fine meshes have one shape."""
+_LATTICE_STEP = 2.0 / 128
+"""Step at which atlases are evaluated for finer meshes; costs .03 mm on average, .8 mm at worst."""
+_FINE = 0.75 * _LATTICE_STEP
+"""Triangle side below which interpolating saves time."""
 SLIVER = 0.1
 """Longest edge that one panel may have and the other lack [network units]."""
 
@@ -188,6 +194,8 @@ def lift_points(
 ) -> dict[str, Float[Tensor, "_ 3"]]:  # fmt: skip
     """Map every panel point to the rest body [m] (Eq. 3); differentiable in the code.
 
+    On fine meshes the atlas is evaluated on a lattice and along the border, and interpolated.
+
     Args:
         model: The category's networks, at the precision of ``code``.
         sewn: Flat panels [network units].
@@ -198,12 +206,18 @@ def lift_points(
     """
     lifted = {}
     for side, panel in sewn.panels.items():
+        atlas = model.atlases[side]
+        if border is None and sewn.spacing < _FINE:
+            on_border = np.flatnonzero(panel.border_label)
+            lattice = LatticeInterpolation.build(panel.points, on_border, step=_LATTICE_STEP)
+            lifted[side] = lattice(partial(atlas, code=code), code)
+            continue
         xy = torch.from_numpy(panel.points).to(code)
         if border is not None:
             slope = border[side]
             risen = model.panel_fields[side].signed_distance(xy[slope.points], code) - slope.distance
             xy = xy.index_add(0, slope.points, -slope.step * risen[:, None])
-        lifted[side] = model.atlases[side](xy, code)
+        lifted[side] = atlas(xy, code)
     return lifted
 
 

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import isp_assets
 from isp_assets.bundle import GarmentBundle
-from isp_assets.decode import decode_with_report
+from isp_assets.decode import SLIVER, cut_panels, decode_with_report, lift_points
 from isp_assets.errors import DecodeError
 from isp_assets.garment import Garment
+from isp_assets.geometry.sewing import sew_panels
 from isp_assets.geometry.topology import boundary_loops, edges
 
 FOLDER = Path(isp_assets.__file__).parent / "data" / "collection"
@@ -89,3 +91,18 @@ def test_far_codes_decode_or_say_why(bundle):
 def test_every_code_and_many_more(bundle, resolution):
     codes = [*bundle.codes.values(), *_random_codes(bundle, 200), *_between_codes(bundle, 100)]
     assert _decode_all(bundle, codes, resolution) == []
+
+
+def test_fine_meshes_lie_where_the_atlas_says(bundle: GarmentBundle):
+    code = list(bundle.codes.values())[7]
+    outlines = cut_panels(bundle.model, code, resolution=256).outlines
+    sewn = sew_panels(outlines, bundle.model.seam_pairs, spacing=2 / 256, sliver=SLIVER)
+    latent = torch.from_numpy(code)
+    with torch.no_grad():
+        lifted = lift_points(bundle.model, sewn, latent)
+        for side, panel in sewn.panels.items():
+            exact = bundle.model.atlases[side](torch.from_numpy(panel.points).float(), latent)
+            error = (lifted[side] - exact).norm(dim=1)
+            assert 0 < float(error.mean()) < 6e-5  # interpolated, and closely
+            assert float(error.max()) < 1e-3
+            assert float(error[torch.from_numpy(panel.border_label > 0)].max()) < 1e-6

@@ -43,7 +43,9 @@ def seam_fade(
         empty = np.empty((0, 1))
         return SeamFade(np.empty(0, dtype=np.int64), empty.astype(np.int64), empty)
     # Unbalanced: a balanced tree can hang where the processor flushes denormal numbers.
-    distance, nearest = cKDTree(points[sewn], balanced_tree=False).query(points, k=np.arange(1, count + 1))
+    tree = cKDTree(points[sewn], balanced_tree=False)
+    distance, nearest = tree.query(points, k=np.arange(1, count + 1), distance_upper_bound=reach)
+    nearest[np.isinf(distance)] = 0  # fewer are in reach: any will do, its share is 0
     near = distance[:, 0] < reach
     near[sewn] = False
     rows = np.flatnonzero(near)

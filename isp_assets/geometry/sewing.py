@@ -60,6 +60,8 @@ class SewnPanels:
     panels: Mapping[str, FlatPanel]
     seams: tuple[FlatSeam, ...]
     num_vertices: int
+    spacing: float
+    """Length of a triangle's side."""
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:
@@ -122,7 +124,7 @@ def sew_panels(
     vertex, count = weld(total, np.concatenate([*pairs, np.empty((0, 2), dtype=np.int64)]))
     index = {"front": vertex[:offset], "back": vertex[offset:]}
     sewn = SewnPanels(
-        {side: replace(panels[side], vertex_index=index[side]) for side in PANELS}, seams, count
+        {side: replace(panels[side], vertex_index=index[side]) for side in PANELS}, seams, count, spacing
     )
     _check_surface(sewn.faces)
     return sewn
