@@ -4,6 +4,9 @@ import numpy as np
 from igl import predicates
 from jaxtyping import Float, Int
 
+Boxes = tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
+"""Lower and upper corners."""
+
 
 def crossing_pairs(
     vertices: Float[np.ndarray, "V 3"],
@@ -13,14 +16,15 @@ def crossing_pairs(
 ) -> Int[np.ndarray, "n 2"]:
     """All pairs (face, other face) that share a point, sorted; touching counts.
 
-    Faces outside the other mesh's bounding box are put aside first, so meshes that
-    lie apart cost next to nothing.
+    Faces outside the bounding box of the other faces are put aside first, so meshes
+    that lie apart cost next to nothing.
     """
-    low = np.maximum(vertices.min(0), other_vertices.min(0))
-    high = np.minimum(vertices.max(0), other_vertices.max(0))
-    mine, theirs = (
-        _inside_box(vertices, faces, low, high),
-        _inside_box(other_vertices, other_faces, low, high),
+    if len(faces) == 0 or len(other_faces) == 0:
+        return np.zeros((0, 2), np.int64)
+    boxes, other_boxes = _boxes(vertices, faces), _boxes(other_vertices, other_faces)
+    mine = _meeting(boxes, other_boxes[0].min(0), other_boxes[1].max(0))
+    theirs = _meeting(
+        other_boxes, boxes[0][mine].min(0, initial=np.inf), boxes[1][mine].max(0, initial=-np.inf)
     )
     if len(mine) == 0 or len(theirs) == 0:
         return np.zeros((0, 2), np.int64)
@@ -35,10 +39,15 @@ def crossing_pairs(
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # several threads find them, in any order
 
 
-def _inside_box(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Faces whose own bounding box meets the box."""
+def _boxes(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Boxes:
+    """Bounding boxes of faces."""
     first, second, third = (vertices[corner] for corner in faces.T)
-    above = np.maximum(np.maximum(first, second), third) >= low
-    below = np.minimum(np.minimum(first, second), third) <= high
-    both = above & below
+    return np.minimum(np.minimum(first, second), third), np.maximum(np.maximum(first, second), third)
+
+
+def _meeting(
+    boxes: Boxes, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]
+) -> Int[np.ndarray, " n"]:
+    """Rows of the boxes that meet a box."""
+    both = (boxes[1] >= low) & (boxes[0] <= high)
     return np.flatnonzero(both[:, 0] & both[:, 1] & both[:, 2])

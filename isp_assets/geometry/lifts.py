@@ -13,18 +13,24 @@ from isp_assets.geometry.obstacle import Obstacle
 
 AROUND = 0.015
 """Vertices this near [m] at the start make the surface around them a neighbour."""
+ASIDE = 0.06
+"""Cloth this far [m] outside the bounds of a part still has its closest point there."""
 WATCHED = 0.008
 """Vertices this near [m] at the start are looked at again in every round."""
 
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
 _MOST_RINGS = 8
+_COVERING = 2.0  # edges from its open border from which a layer covers what lies beneath it
 
 
 class Neighbour:
     """What is known of one obstacle: where the garment comes near it."""
 
-    def __init__(self, obstacle: Obstacle, found: Closest, *, edge: float) -> None:
-        self.obstacle = obstacle
+    def __init__(
+        self, obstacle: Obstacle, own: Bool[np.ndarray, "V 6"], found: Closest, *, edge: float
+    ) -> None:
+        self.obstacle, self.own = obstacle, own
+        """Parts of the obstacle that each vertex must stay above: its own that no outer layer covers."""
         topology = obstacle.mesh.topology
         near = found.height < AROUND
         close = np.zeros(len(obstacle.vertices), bool)
@@ -35,11 +41,31 @@ class Neighbour:
         self.found: Closest | None = found
         """What the first query found, until vertices move."""
         self.watched = found.height < WATCHED
-        self.watched_foreign: Bool[np.ndarray, " V"] | None = None
+        self.other: Bool[np.ndarray, "V 6"] | None = None
+        """The same for parts that a vertex does not belong to; None until they are first looked at."""
+        self.watched_other = np.ones(len(own), bool)
         self.vertices = np.flatnonzero(close & ~obstacle.tight)
         self.faces = np.flatnonzero(any_corner(close, topology.faces))
         beneath = any_corner(obstacle.tight, topology.faces)[found.face]
         self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
+
+
+def open_beneath(
+    open_parts: Bool[np.ndarray, "V 6"], obstacle: Obstacle, found: Closest
+) -> Bool[np.ndarray, "V 6"]:
+    """Parts that vertices may still meet further in, once they were compared with ``obstacle``.
+
+    What is clear of a layer is clear of all that lies beneath it. Near the layer's border a
+    vertex may slip off it, and where the layer had no room it may not be clear itself.
+    """
+    covered = np.isfinite(found.height) & ~found.on_border & ~found.on_cut
+    index = np.flatnonzero(covered)
+    inner = obstacle.border_rings_at(found)[index] >= _COVERING
+    tight = any_corner(obstacle.tight, obstacle.mesh.topology.faces)[found.face[index]]
+    index = index[inner & ~tight]
+    result = open_parts.copy()
+    result[index] &= ~obstacle.parts_at(found.face[index])
+    return result
 
 
 def shortest_way(

@@ -181,8 +181,9 @@ class Obstacle:
             np.full(len(points), np.inf), np.zeros(len(points), bool), np.zeros(len(points), bool),
         )  # fmt: skip
         for part, (low, high) in enumerate(self.part_boxes):
-            near = parts[:, part] & (points >= low - within).all(1) & (points <= high + within).all(1)
-            index = np.flatnonzero(near)
+            index = np.flatnonzero(parts[:, part])
+            here = points[index]
+            index = index[((here >= low - within) & (here <= high + within)).all(1)]
             if len(index) == 0:
                 continue
             found = self._query(part)(points[index])

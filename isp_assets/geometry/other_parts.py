@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from isp_assets.geometry.closest import Closest
 from isp_assets.geometry.draw_in import draw_in
-from isp_assets.geometry.lifts import WATCHED, Neighbour, shortest_way
+from isp_assets.geometry.lifts import ASIDE, WATCHED, Neighbour, open_beneath, shortest_way, towards
 from isp_assets.geometry.spread import keep_larger
 
 
@@ -19,8 +19,6 @@ from isp_assets.geometry.spread import keep_larger
 class Ways:
     """Where a garment's vertices may go to leave other parts."""
 
-    inwards: Float[np.ndarray, "V 3"]
-    """Unit directions to the own part of the body; zero where it is not known."""
     room: Float[np.ndarray, " V"]
     """How far each is above the margins over its own parts [m]; infinite where there are none."""
     reach: float
@@ -40,15 +38,19 @@ def leave_other_parts(
     Args:
         position: The garment [m].
         parts: Which body parts each vertex belongs to.
-        near: The body, then every inner garment.
+        near: Every inner garment from the outermost in, then the body.
         ways: Where the vertices may go.
 
     Returns:
         The moves [m], and the vertices that touch another part.
     """
     lift, touched = np.zeros_like(position), np.zeros_like(parts)
+    if near[0].other is None:
+        _look(position, parts, near)
     for neighbour in near:
-        index, found = _contacts(position, parts, neighbour)
+        assert neighbour.other is not None
+        index = np.flatnonzero(neighbour.watched_other)
+        found = _touch(position[index], neighbour.other[index], neighbour)
         margin = np.full(len(index), neighbour.obstacle.margin)
         touching = found.height < margin
         touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
@@ -58,41 +60,49 @@ def leave_other_parts(
     lift *= np.minimum(1, ways.room / np.maximum(size, 1e-9))[:, None]
     touched &= ~parts
     pressed: Bool[np.ndarray, " V"] = np.asarray(touched.any(axis=1))
-    index = np.flatnonzero(pressed & np.isfinite(ways.room) & (ways.room > 0) & ways.inwards.any(1))
+    index = np.flatnonzero(pressed & np.isfinite(ways.room) & (ways.room > 0))
+    skin = near[-1].obstacle.contacts(position[index], parts[index], within=ASIDE)
+    inwards = towards(position[index], skin)
+    known = inwards.any(1)
+    index, inwards = index[known], inwards[known]
     if len(index):
         moves, clear = draw_in(
-            position[index], ways.inwards[index], ways.room[index],
-            lambda points, rows: _clearance(points, touched[index[rows]], near),
+            position[index], inwards, ways.room[index],
+            lambda points, rows: _clearance(points, touched[index[rows]], index[rows], near),
         )  # fmt: skip
         known = clear | (ways.room[index] < ways.reach)
         lift[index[known]] = moves[known]
     return lift, pressed
 
 
-def _contacts(
-    position: Float[np.ndarray, "V 3"], parts: Bool[np.ndarray, "V 6"], neighbour: Neighbour
-) -> tuple[Int[np.ndarray, " n"], Closest]:
-    watched = neighbour.watched_foreign
-    index = np.arange(len(position)) if watched is None else np.flatnonzero(watched)
-    margin = neighbour.obstacle.margin
-    found = _sure(neighbour.obstacle.contacts(position[index], ~parts[index], within=margin))
-    if watched is None:
-        neighbour.watched_foreign = found.height < WATCHED
-    return index, found
+def _look(
+    position: Float[np.ndarray, "V 3"], parts: Bool[np.ndarray, "V 6"], near: Sequence[Neighbour]
+) -> None:
+    """Decide which other parts each vertex may meet on which neighbour, and where it is near them."""
+    open_parts = ~parts
+    for neighbour in near:
+        neighbour.other = open_parts
+        found = _touch(position, neighbour.other, neighbour)
+        neighbour.watched_other = found.height < WATCHED
+        open_parts = open_beneath(open_parts, neighbour.obstacle, found)
 
 
 def _clearance(
-    points: Float[np.ndarray, "n 3"], parts: Bool[np.ndarray, "n 6"], near: Sequence[Neighbour]
+    points: Float[np.ndarray, "n 3"],
+    parts: Bool[np.ndarray, "n 6"],
+    rows: Int[np.ndarray, " n"],
+    near: Sequence[Neighbour],
 ) -> Float[np.ndarray, " n"]:
     """How far points are above the margins over some parts [m]; negative where they touch."""
     least = np.full(len(points), np.inf)
     for neighbour in near:
-        margin = neighbour.obstacle.margin
-        found = _sure(neighbour.obstacle.contacts(points, parts, within=margin))
-        least = np.minimum(least, found.height - margin)
+        assert neighbour.other is not None
+        found = _touch(points, parts & neighbour.other[rows], neighbour)
+        least = np.minimum(least, found.height - neighbour.obstacle.margin)
     return least
 
 
-def _sure(found: Closest) -> Closest:
-    """The same, with infinite heights where the closest point lies on a border and no side is known."""
+def _touch(points: Float[np.ndarray, "n 3"], parts: Bool[np.ndarray, "n 6"], neighbour: Neighbour) -> Closest:
+    """Closest points on some parts; infinite heights where one lies on a border and no side is known."""
+    found = neighbour.obstacle.contacts(points, parts, within=neighbour.obstacle.margin)
     return replace(found, height=np.where(found.on_border | found.on_cut, np.inf, found.height))

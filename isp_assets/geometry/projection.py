@@ -22,12 +22,12 @@ from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import ClosestQuery, unit_face_normals
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.lifts import (
-    AROUND,
+    ASIDE,
     Neighbour,
     any_corner,
     largest_per_vertex,
+    open_beneath,
     shortest_way,
-    towards,
 )
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.other_parts import Ways, leave_other_parts
@@ -40,7 +40,6 @@ LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
-_ASIDE = 0.06  # cloth this far [m] outside the bounds of a part of the body still has its closest point there
 _CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _FINISH_STEP = 0.002  # largest lift [m] of one such correction
@@ -142,13 +141,13 @@ class _Projector:
     ) -> None:
         self.start = self.position = position
         self.mesh, self.options, self.stretch = mesh, options, stretch
-        aside = [_ASIDE] + [AROUND] * (len(obstacles) - 1)
-        first = [
-            o.contacts(position, mesh.parts, within=within)
-            for o, within in zip(obstacles, aside, strict=True)
-        ]
-        edge = mean_edge(position, mesh.topology.faces)
-        self.near = [Neighbour(o, found, edge=edge) for o, found in zip(obstacles, first, strict=True)]
+        self.near: list[Neighbour] = []
+        """What lies beneath, the outermost layer first and the body last."""
+        open_parts, edge = mesh.parts, mean_edge(position, mesh.topology.faces)
+        for obstacle in reversed(obstacles):
+            found = obstacle.contacts(position, open_parts, within=ASIDE)
+            self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
+            open_parts = open_beneath(open_parts, obstacle, found)
         self.tight = np.zeros(len(position), bool)
         self.pressed = np.zeros(len(position), bool)
         """Vertices between two body parts: what lifts them off one drives them into the other."""
@@ -175,18 +174,19 @@ class _Projector:
 
     def finish(self) -> int:
         """Lift triangles over the planes of the triangles they still cross; the number left."""
-        crossings = 0
+        moved: Bool[np.ndarray, " V"] = np.ones(len(self.position), bool)
+        known = [np.zeros((0, 2), np.int64)] * len(self.near)
         for attempt in range(self.options.finish + 1):
-            lift, crossings = np.zeros_like(self.position), 0
-            for neighbour in self.near:
-                pairs = self._crossings(neighbour)
-                crossings += len(pairs)
+            lift = np.zeros_like(self.position)
+            for number, neighbour in enumerate(self.near):
+                known[number] = pairs = self._crossings(neighbour, moved, known[number])
                 if len(pairs) and attempt < self.options.finish:
                     keep_larger(lift, self._part(neighbour.obstacle, pairs))
             if not lift.any():
                 break
             self._move(lift)
-        return crossings
+            moved = (lift != 0).any(axis=1)
+        return sum(map(len, known))
 
     def _move(self, step: Float[np.ndarray, "V 3"]) -> None:
         self.position = self.position + step
@@ -202,12 +202,11 @@ class _Projector:
     def _lift_vertices(self, *, foreign: bool) -> Float[np.ndarray, "V 3"]:
         """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
         own = np.zeros_like(self.position)
-        room, inwards = np.full(len(self.position), np.inf), np.zeros_like(self.position)
+        room = np.full(len(self.position), np.inf)
         for neighbour in self.near:
             obstacle, index, found = neighbour.obstacle, np.flatnonzero(neighbour.watched), neighbour.found
             if found is None:
-                within = _ASIDE if neighbour is self.near[0] else AROUND
-                found = obstacle.contacts(self.position[index], self.mesh.parts[index], within=within)
+                found = obstacle.contacts(self.position[index], neighbour.own[index], within=ASIDE)
             else:
                 index = np.arange(len(self.position))
             points = self.position[index]
@@ -216,11 +215,9 @@ class _Projector:
             keep_larger(own, shortest_way(points, found, margin, reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
-            if neighbour is self.near[0]:
-                inwards[index] = towards(points, found)
         if not foreign:
             return own
-        ways = Ways(inwards, room, self.options.reach, self.options.foreign_reach)
+        ways = Ways(room, self.options.reach, self.options.foreign_reach)
         other, pressed = leave_other_parts(self.position, self.mesh.parts, self.near, ways)
         self.pressed |= pressed
         return np.where((own != 0).any(1, keepdims=True), own, other)
@@ -248,20 +245,25 @@ class _Projector:
             keep_larger(lift, largest_per_vertex(corner, push, len(position)))
         return lift
 
-    def _crossings(self, neighbour: Neighbour) -> Int[np.ndarray, "n 2"]:
-        """Crossing pairs of faces that share a body part and have room."""
-        obstacle, faces, beneath = (
-            neighbour.obstacle,
-            self.mesh.topology.faces,
-            neighbour.obstacle.mesh.topology.faces,
-        )
-        mine = np.flatnonzero(any_corner(neighbour.watched, faces))
+    def _crossings(
+        self, neighbour: Neighbour, moved: Bool[np.ndarray, " V"], known: Int[np.ndarray, "m 2"]
+    ) -> Int[np.ndarray, "n 2"]:
+        """Crossing pairs of faces that share a body part and have room.
+
+        Args:
+            neighbour: The obstacle.
+            moved: Vertices that moved since the last time.
+            known: Pairs of the last time.
+        """
+        obstacle, faces = neighbour.obstacle, self.mesh.topology.faces
+        beneath, stirred = obstacle.mesh.topology.faces, any_corner(moved, faces)
+        mine = np.flatnonzero(any_corner(neighbour.watched, faces) & stirred)
         pairs = crossing_pairs(self.position, faces[mine], obstacle.vertices, beneath[neighbour.faces])
         pairs = np.stack([mine[pairs[:, 0]], neighbour.faces[pairs[:, 1]]], axis=1)
         above, below = faces[pairs[:, 0]], beneath[pairs[:, 1]]
         own = (self.mesh.parts[above].any(1) & obstacle.mesh.parts[below].any(1)).any(1)
         trapped = (self.tight | self.pressed)[above].any(1) | obstacle.tight[below].any(1)
-        return pairs[own & ~trapped]
+        return np.concatenate([known[~stirred[known[:, 0]]], pairs[own & ~trapped]])
 
     def _part(self, obstacle: Obstacle, pairs: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "V 3"]:
         """Lift the garment's triangle of each pair over the plane of the other one."""
