@@ -63,6 +63,19 @@ def test_a_ridge_that_pokes_through_a_triangle_lifts_its_corners() -> None:
     assert len(crossing_pairs(done.vertices, coarse[1], fine, faces)) == 0
 
 
+def test_layers_keep_their_order_where_there_is_no_room() -> None:
+    """Where the body presses cloth together margins are given up, the order of the layers is not."""
+    outer, (fine, faces) = sheet(6, height=0.006), sheet(41)
+    fine[:, 1] = 0.008 * np.exp(-((fine[:, 0] / 0.004) ** 2))
+    mesh = collision((fine, faces))
+    inner = Obstacle(mesh, fine, margin=0.0025, tight=np.ones(len(fine), bool))
+    body = obstacle(sheet(41, height=-0.05))
+    assert len(crossing_pairs(*outer, fine, faces)) > 10
+    done = project(outer[0], collision(outer), [body, inner])
+    assert len(crossing_pairs(done.vertices, outer[1], fine, faces)) == 0
+    assert done.largest_move < 0.006
+
+
 def test_swapped_layers_are_untangled() -> None:
     outer, inner = tube(0.100), tube(0.112)
     below = obstacle(inner, margin=0.0025)

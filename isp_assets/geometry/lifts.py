@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from isp_assets.geometry.closest import Closest
+from isp_assets.geometry.closest import Closest, unit_face_normals
 from isp_assets.geometry.obstacle import Obstacle
 
 AROUND = 0.015
@@ -17,8 +17,14 @@ ASIDE = 0.06
 """Cloth this far [m] outside the bounds of a part still has its closest point there."""
 WATCHED = 0.008
 """Vertices this near [m] at the start are looked at again in every round."""
+CLEAR = 0.0003
+"""How far [m] a triangle that was found on the wrong side is lifted over the other surface."""
+SAME_SIDE = 0.25
+"""Cosine from which two pieces of surface count as facing the same way."""
 
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
+_FINISH_STEP = 0.002  # largest lift [m] of a crossing triangle in one round
+_PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _MOST_RINGS = 8
 _COVERING = 2.0  # edges from its open border from which a layer covers what lies beneath it
 
@@ -44,7 +50,7 @@ class Neighbour:
         self.other: Bool[np.ndarray, "V 6"] | None = None
         """The same for parts that a vertex does not belong to; None until they are first looked at."""
         self.watched_other = np.ones(len(own), bool)
-        self.vertices = np.flatnonzero(close & ~obstacle.tight)
+        self.vertices = np.flatnonzero(close)
         self.faces = np.flatnonzero(any_corner(close, topology.faces))
         beneath = any_corner(obstacle.tight, topology.faces)[found.face]
         self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
@@ -87,6 +93,25 @@ def towards(points: Float[np.ndarray, "P 3"], found: Closest) -> Float[np.ndarra
     above = (found.height > 1e-6) & np.isfinite(found.height)
     length = np.where(above, found.height, 1.0)[:, None]
     return np.where(above[:, None], (found.point - points) / length, 0.0)
+
+
+def over_planes(
+    position: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    obstacle: Obstacle,
+    pairs: Int[np.ndarray, "n 2"],
+) -> Float[np.ndarray, "V 3"]:
+    """Lifts of the garment's triangle of each crossing pair over the plane of the other one."""
+    mine, theirs = faces[pairs[:, 0]], obstacle.mesh.topology.faces[pairs[:, 1]]
+    normal, beneath = unit_face_normals(position, mine), obstacle.normals.of_faces[pairs[:, 1]]
+    alike = np.einsum("pc,pc->p", normal, beneath)
+    # Where the other triangle stands across the garment (a fold), its plane leads nowhere.
+    plane = np.where((alike > _PARALLEL)[:, None], beneath, normal)
+    top = np.einsum("pkc,pc->pk", obstacle.vertices[theirs], plane).max(1)
+    height = np.einsum("pkc,pc->pk", position[mine], plane)
+    need = (top[:, None] + CLEAR - height).clip(0, _FINISH_STEP)
+    push = need[..., None] * plane[:, None] * (alike > -SAME_SIDE)[:, None, None]
+    return largest_per_vertex(mine, push, len(position))
 
 
 def largest_per_vertex(

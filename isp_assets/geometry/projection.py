@@ -5,7 +5,8 @@ beneath, and the corners of garment triangles are lifted over vertices that poke
 through them. Each lift is spread over the neighbourhood and what it stretched is eased,
 so that no spike stands out; the last rounds lift without spreading, down to the pairs
 of triangles that an exact test still finds crossing. Cloth between two body parts (an
-arm and the torso) is drawn in towards its own part. Only vertices that came near
+arm and the torso) is drawn in towards its own part. Where there is no room, margins are
+given up, the order of the layers last of all. Only vertices that came near
 something are looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
@@ -19,14 +20,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import ClosestQuery, unit_face_normals
+from isp_assets.geometry.closest import Closest, ClosestQuery
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.lifts import (
     ASIDE,
+    CLEAR,
+    SAME_SIDE,
     Neighbour,
     any_corner,
     largest_per_vertex,
     open_beneath,
+    over_planes,
     shortest_way,
 )
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
@@ -40,14 +44,11 @@ LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
 _CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
-_CLEAR = 0.0003  # how far [m] a crossing triangle is lifted over the plane of the other
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
-_FINISH_STEP = 0.002  # largest lift [m] of one such correction
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
 _RIM_REACH = 0.015  # contact deeper than this [m] is left alone there
-_PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
-_SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
+_ORDER_REACH = 0.015  # a garment further beneath an inner one than this [m] cannot be put above it alone
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,9 @@ def project(
     eased = start if stretch is None else stretch.ease(start, steps=options.ease)
     work = _Projector(eased, mesh, obstacles, options, stretch)
     rounds = work.lift()
+    work.keep_order()
     crossings = work.finish()
+    work.keep_order()
     move = float(np.linalg.norm(work.position - start, axis=1).max(initial=0))
     return Projection(work.position, move > 0, rounds, move, work.tight, work.pressed, crossings)
 
@@ -161,7 +164,7 @@ class _Projector:
             last = done == options.rounds - 1
             lift = self._lift_vertices(foreign=not last)
             if done > 0 or not lift.any():
-                poke = self._lift_triangles(self.position + lift)
+                poke = self._lift_triangles(self.position + lift, self.near)
                 lift = np.where((lift != 0).any(1, keepdims=True), lift, poke)
             if np.abs(lift).max(initial=0) < options.tolerance:
                 return done
@@ -172,6 +175,23 @@ class _Projector:
                 self._move(self.stretch.ease(self.position, steps=options.ease - 1) - self.position)
         return options.rounds
 
+    def keep_order(self) -> None:
+        """Lift what still lies beneath an inner garment just above it, where there is no room as well.
+
+        Margins are not asked for and nothing spreads: what lies on an inner garment is no
+        worse off than that garment.
+        """
+        layers = self.near[:-1]
+        if not layers:
+            return
+        lift = np.zeros_like(self.position)
+        for neighbour in layers:
+            index, found = self._own_contacts(neighbour)
+            margin, reach = np.full(len(index), CLEAR), np.full(len(index), _ORDER_REACH)
+            keep_larger(lift, shortest_way(self.position[index], found, margin, reach), index)
+        poke = self._lift_triangles(self.position + lift, layers, cramped=True)
+        self._move(np.where((lift != 0).any(1, keepdims=True), lift, poke))
+
     def finish(self) -> int:
         """Lift triangles over the planes of the triangles they still cross; the number left."""
         moved: Bool[np.ndarray, " V"] = np.ones(len(self.position), bool)
@@ -181,7 +201,9 @@ class _Projector:
             for number, neighbour in enumerate(self.near):
                 known[number] = pairs = self._crossings(neighbour, moved, known[number])
                 if len(pairs) and attempt < self.options.finish:
-                    keep_larger(lift, self._part(neighbour.obstacle, pairs))
+                    keep_larger(
+                        lift, over_planes(self.position, self.mesh.topology.faces, neighbour.obstacle, pairs)
+                    )
             if not lift.any():
                 break
             self._move(lift)
@@ -204,15 +226,10 @@ class _Projector:
         own = np.zeros_like(self.position)
         room = np.full(len(self.position), np.inf)
         for neighbour in self.near:
-            obstacle, index, found = neighbour.obstacle, np.flatnonzero(neighbour.watched), neighbour.found
-            if found is None:
-                found = obstacle.contacts(self.position[index], neighbour.own[index], within=ASIDE)
-            else:
-                index = np.arange(len(self.position))
-            points = self.position[index]
+            obstacle, (index, found) = neighbour.obstacle, self._own_contacts(neighbour)
             margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
             reach = np.where(obstacle.border_rings_at(found) < _RIM, _RIM_REACH, self.options.reach)
-            keep_larger(own, shortest_way(points, found, margin, reach), index)
+            keep_larger(own, shortest_way(self.position[index], found, margin, reach), index)
             spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
             room[index] = np.minimum(room[index], spare)
         if not foreign:
@@ -222,22 +239,40 @@ class _Projector:
         self.pressed |= pressed
         return np.where((own != 0).any(1, keepdims=True), own, other)
 
-    def _lift_triangles(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-        """Lift the corners of triangles over obstacle vertices that poke through them."""
+    def _own_contacts(self, neighbour: Neighbour) -> tuple[Int[np.ndarray, " n"], Closest]:
+        """Vertices that are near an obstacle, and their closest points on it."""
+        if neighbour.found is not None:
+            return np.arange(len(self.position)), neighbour.found
+        index = np.flatnonzero(neighbour.watched)
+        points, own = self.position[index], neighbour.own[index]
+        return index, neighbour.obstacle.contacts(points, own, within=ASIDE)
+
+    def _lift_triangles(
+        self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, cramped: bool = False
+    ) -> Float[np.ndarray, "V 3"]:
+        """Lift the corners of triangles over obstacle vertices that poke through them.
+
+        Args:
+            position: The garment [m].
+            near: The obstacles.
+            cramped: Lift where there is no room as well, and only just clear.
+        """
         lift = np.zeros_like(position)
-        if not any(len(neighbour.vertices) for neighbour in self.near):
+        if not any(len(neighbour.faces) for neighbour in near):
             return lift
         query, faces = ClosestQuery(position, self.mesh.topology), self.mesh.topology.faces
-        for neighbour in self.near:
-            obstacle, index = neighbour.obstacle, neighbour.vertices
+        for neighbour in near:
+            obstacle = neighbour.obstacle
+            index = neighbour.vertices if cramped else neighbour.vertices[~obstacle.tight[neighbour.vertices]]
             found = query(obstacle.vertices[index])
-            gap = obstacle.margin / 2  # vertices keep the whole margin; half of it allows for their chords
+            # Vertices keep the whole margin; half of it allows for their chords.
+            gap = CLEAR if cramped else obstacle.margin / 2
             facing = np.einsum("pc,pc->p", obstacle.normals.of_vertices[index], found.normal)
             poking = (found.height > -gap) & (found.height < self.options.poke_reach) & ~found.on_border
-            hit = np.flatnonzero(poking & (facing > _SAME_SIDE))
+            hit = np.flatnonzero(poking & (facing > SAME_SIDE))
             corner = faces[found.face[hit]]
             own = (self.mesh.parts[corner].any(1) & obstacle.mesh.parts[index[hit]]).any(1)
-            free = own & ~self.tight[corner].any(1)
+            free = own & (cramped | ~self.tight[corner].any(1))
             hit, corner, weights = hit[free], corner[free], found.weights[hit[free]]
             share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
             size = (found.height[hit] + gap)[:, None] * share
@@ -264,16 +299,3 @@ class _Projector:
         own = (self.mesh.parts[above].any(1) & obstacle.mesh.parts[below].any(1)).any(1)
         trapped = (self.tight | self.pressed)[above].any(1) | obstacle.tight[below].any(1)
         return np.concatenate([known[~stirred[known[:, 0]]], pairs[own & ~trapped]])
-
-    def _part(self, obstacle: Obstacle, pairs: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "V 3"]:
-        """Lift the garment's triangle of each pair over the plane of the other one."""
-        faces, beneath = self.mesh.topology.faces[pairs[:, 0]], obstacle.mesh.topology.faces[pairs[:, 1]]
-        mine, theirs = unit_face_normals(self.position, faces), obstacle.normals.of_faces[pairs[:, 1]]
-        alike = np.einsum("pc,pc->p", mine, theirs)
-        # Where the other triangle stands across the garment (a fold), its plane leads nowhere.
-        plane = np.where((alike > _PARALLEL)[:, None], theirs, mine)
-        top = np.einsum("pkc,pc->pk", obstacle.vertices[beneath], plane).max(1)
-        height = np.einsum("pkc,pc->pk", self.position[faces], plane)
-        need = (top[:, None] + _CLEAR - height).clip(0, _FINISH_STEP)
-        push = need[..., None] * plane[:, None] * (alike > -_SAME_SIDE)[:, None, None]
-        return largest_per_vertex(faces, push, len(self.position))
