@@ -6,8 +6,8 @@ through them. Each lift is spread over the neighbourhood and what it stretched i
 so that no spike stands out; the last rounds lift without spreading, down to the pairs
 of triangles that an exact test still finds crossing. Cloth between two body parts (an
 arm and the torso) is drawn in towards its own part. Where there is no room, margins are
-given up, the order of the layers last of all. Only vertices that came near
-something are looked at again.
+given up, the order of the layers last of all. Only vertices that came near something
+are looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.
