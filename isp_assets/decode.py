@@ -24,6 +24,7 @@ from isp_assets.garment_model import GarmentModel
 from isp_assets.geometry.edge_runs import EdgeRun, split_edges
 from isp_assets.geometry.lattice_interpolation import LatticeInterpolation
 from isp_assets.geometry.outline import PlaneField, trace_outline
+from isp_assets.geometry.seam_fairing import fair_seams
 from isp_assets.geometry.sewing import FlatPanel, SewnPanels, sew_panels
 from isp_assets.networks.panel_field import PanelField
 
@@ -34,7 +35,9 @@ _OUTLINE_CELLS = 256
 _LATTICE_STEP = 2.0 / 128
 """Step at which atlases are evaluated for finer meshes; costs .03 mm on average, .8 mm at worst."""
 _FINE = 0.75 * _LATTICE_STEP
-"""Triangle side below which interpolating saves time."""
+"""Triangle side below which interpolating saves time, and seams are smoothed."""
+_FAIR_REACH = 0.03
+"""Distance from a seam up to which smoothing reaches [network units]."""
 SLIVER = 0.1
 """Longest edge that one panel may have and the other lack [network units]."""
 
@@ -102,6 +105,8 @@ def decode_with_report(
         with torch.no_grad():
             lifted = lift_points(model, sewn, torch.from_numpy(code))
             rest = weld_points(sewn, lifted).numpy()
+        if sewn.spacing < _FINE:
+            rest = fair_seams(rest, sewn.faces, sewn.seam_distance, reach=_FAIR_REACH)
         times.append(time.perf_counter())
         garment = _garment(model, sewn, code, rest, name)
     except (GeometryError, GarmentError) as error:

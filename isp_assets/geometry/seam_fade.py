@@ -26,6 +26,8 @@ class SeamFade:
     """The seam points that each follows."""
     weights: Float[np.ndarray, "n k"]
     """Share of each seam point's move; their sum falls from 1 at the seam to 0 at the reach."""
+    distance: Float[np.ndarray, " n"]
+    """To the nearest seam point, in the units of the panel."""
 
 
 def seam_fade(
@@ -41,7 +43,7 @@ def seam_fade(
     count = min(_SOURCES, len(sewn))
     if count == 0:
         empty = np.empty((0, 1))
-        return SeamFade(np.empty(0, dtype=np.int64), empty.astype(np.int64), empty)
+        return SeamFade(np.empty(0, dtype=np.int64), empty.astype(np.int64), empty, np.empty(0))
     # Unbalanced: a balanced tree can hang where the processor flushes denormal numbers.
     tree = cKDTree(points[sewn], balanced_tree=False)
     distance, nearest = tree.query(points, k=np.arange(1, count + 1), distance_upper_bound=reach)
@@ -52,4 +54,4 @@ def seam_fade(
     distance, nearest = distance[rows], nearest[rows]
     weights = 1.0 / np.maximum(distance, 1e-9) ** 2
     weights *= ((1.0 - distance[:, :1] / reach) ** 2) / weights.sum(axis=1, keepdims=True)
-    return SeamFade(rows, sewn[nearest], weights)
+    return SeamFade(rows, sewn[nearest], weights, distance[:, 0])

@@ -77,6 +77,22 @@ class SewnPanels:
             fades[side] = seam_fade(panel.points, np.unique(np.concatenate([*sewn, _NONE])))
         return fades
 
+    @property
+    def seam_distance(self) -> Float[np.ndarray, " V"]:
+        """Distance of every vertex from the nearest seam point; infinite far away and on open borders."""
+        distance = np.full(self.num_vertices, np.inf)
+        for seam in self.seams:
+            distance[self.panels["front"].vertex_index[seam.front]] = 0.0
+        for side, panel in self.panels.items():
+            fade = self.fades[side]
+            distance[panel.vertex_index[fade.points]] = fade.distance
+        for side, panel in self.panels.items():
+            sewn = {labels[side != "front"] for labels in (seam.labels for seam in self.seams)}
+            for label, points in panel.runs:
+                if label not in sewn:
+                    distance[panel.vertex_index[points]] = np.inf
+        return distance
+
 
 @dataclass(frozen=True)
 class _Match:
