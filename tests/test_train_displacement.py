@@ -79,11 +79,11 @@ def test_collision_counts_only_what_is_too_near() -> None:
     rest = _rest()
     far = Surface(torch.full((1, 1, 3), -9.0).double(), torch.tensor([[[1.0, 0, 0]]]).double())
     x, contact = _positions()[None], Contact()
-    terms = drape_energies(x, rest, Fabric(), far.gap(x), contact, stiffness=1e4)
+    terms = drape_energies(x, rest, Fabric(), far, contact, stiffness=1e4)
     assert float(terms["collision"]) == 0
     assert torch.equal(terms["strain"], membrane_energy(x, rest, Fabric()))
     plane = Surface(x.mean(1, keepdim=True), torch.tensor([[[1.0, 0, 0]]]).double())
-    assert float(drape_energies(x, rest, Fabric(), plane.gap(x), contact, stiffness=1e4)["collision"]) > 0
+    assert float(drape_energies(x, rest, Fabric(), plane, contact, stiffness=1e4)["collision"]) > 0
 
 
 def test_collision_penalty_is_smooth_where_it_turns_linear() -> None:
@@ -93,9 +93,7 @@ def test_collision_penalty_is_smooth_where_it_turns_linear() -> None:
 
     def penalty(depth: float) -> float:
         moved = x - torch.tensor([0.0, depth - contact.margin, 0], dtype=torch.float64)
-        return float(
-            drape_energies(moved, rest, Fabric(), plane.gap(moved), contact, stiffness=1e4)["collision"]
-        )
+        return float(drape_energies(moved, rest, Fabric(), plane, contact, stiffness=1e4)["collision"])
 
     turn, h = contact.depth, 1e-5
     below, above = penalty(turn) - penalty(turn - h), penalty(turn + h) - penalty(turn)

@@ -31,26 +31,6 @@ _BLOCK = 2**24  # distances held at once by the look-up without trees (64 MiB in
 
 
 @dataclass(frozen=True, eq=False)
-class Gap:
-    """Where vertices are between what they must stay above and what bounds them from the other side."""
-
-    height: Float[Tensor, "*batch V"]
-    """Over the surface beneath [m]; differentiable."""
-    ceiling: Float[Tensor, "*batch V"] | None = None
-    """Largest height that is free [m], infinite where nothing bounds it; without gradient."""
-
-    def lacking(self, margin: float) -> Float[Tensor, "*batch V"]:
-        """How far vertices are below ``margin`` [m], 0 for vertices above it."""
-        return torch.relu(margin - self.height)
-
-    def exceeding(self) -> Float[Tensor, "*batch V"]:
-        """How far vertices are above the ceiling [m], 0 for vertices below it."""
-        if self.ceiling is None:
-            return torch.zeros_like(self.height)
-        return torch.relu(self.height - self.ceiling)
-
-
-@dataclass(frozen=True, eq=False)
 class Surface:
     """Oriented samples of a surface that a garment must stay above."""
 
@@ -88,15 +68,6 @@ class Surface:
             points = torch.cat([points, middle], -2)
             normals = torch.cat([normals, face_normals(vertices, faces)], -2)
         return cls(points.detach(), normals.detach(), reach)
-
-    def gap(self, vertices: Float[Tensor, "*batch V 3"]) -> Gap:
-        """Heights over the surface; nothing bounds them from the other side."""
-        return Gap(clearance(vertices, self))
-
-    def frame(self, index: int) -> "Surface":
-        """One batch entry alone, in double precision."""
-        one = slice(index, index + 1)
-        return Surface(self.points[one].double(), self.normals[one].double(), self.reach)
 
     @cached_property
     def trees(self) -> list[cKDTree]:

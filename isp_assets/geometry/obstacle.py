@@ -88,9 +88,11 @@ class CollisionMesh:
         Raises:
             GeometryError: If the mesh is no surface.
         """
-        parts = body_parts(joint_weights)
+        weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
+        parts = weight >= _BELONGS
+        parts[np.arange(len(parts)), weight.argmax(1)] = True
         topology = SurfaceTopology.build(faces, len(joint_weights))
-        of_face = (_part_weights(joint_weights) >= _EXTENDS)[topology.faces].any(1)
+        of_face = (weight >= _EXTENDS)[topology.faces].any(1)
         return cls(topology, parts, tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS))))
 
 
@@ -201,18 +203,6 @@ class Obstacle:
                 normals=self.normals,
             )
         return self._queries[part]
-
-
-def body_parts(joint_weights: Float[np.ndarray, "V 24"]) -> Bool[np.ndarray, "V 6"]:
-    """Which of `BODY_PARTS` each vertex belongs to, at least one, by its skinning weights."""
-    weight = _part_weights(joint_weights)
-    parts = weight >= _BELONGS
-    parts[np.arange(len(parts)), weight.argmax(1)] = True
-    return parts
-
-
-def _part_weights(joint_weights: Float[np.ndarray, "V 24"]) -> Float[np.ndarray, "V 6"]:
-    return np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
 
 
 def mean_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:

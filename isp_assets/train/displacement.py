@@ -23,10 +23,9 @@ from isp_assets.bundle import GarmentBundle, SkinBundle
 from isp_assets.displacement import displace
 from isp_assets.drape_features import drape_features
 from isp_assets.errors import TrainError
+from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import CollisionMesh
-from isp_assets.geometry.part_contact import PartSamples, PosedParts
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.skinning import shape_garment, skin_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
@@ -60,7 +59,7 @@ class PosedBatch:
 
     betas: Float[Tensor, " B"]
     posed: PosedBody
-    parts: PosedParts
+    surface: Surface
 
 
 class DisplacementTask:
@@ -87,8 +86,6 @@ class DisplacementTask:
         }  # fmt: skip
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
-        mesh = CollisionMesh.build(body.faces.cpu().numpy(), body.weights.cpu().numpy())
-        self.samples = PartSamples.of_mesh(mesh).to(self.device)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)
         samples = build_wardrobe(bundle, body, skin.skin_field, wardrobe, seed=seed)
         self.wardrobe = [sample.to(self.device) for sample in samples]
@@ -128,7 +125,7 @@ class DisplacementTask:
         with torch.no_grad():
             betas = betas.to(self.device)
             posed = self.body.pose(poses.to(self.device), betas=betas)
-            return PosedBatch(betas, posed, PosedParts(posed.vertices, self.body.faces, self.samples))
+            return PosedBatch(betas, posed, Surface.of_mesh(posed.vertices, self.body.faces))
 
     def drape(
         self, sample: WornSample, batch: PosedBatch, *, maps: tuple[Tensor, Tensor]
@@ -152,14 +149,14 @@ class DisplacementTask:
         """What measuring a garment in some poses needs besides its positions."""
         shaped = shape_garment(sample.bound, batch.betas)
         rest = graded_rest(sample.rest, sample.bound.canonical, shaped)
-        return DrapeCase(rest, self.fabric, batch.parts.beneath(sample.parts), self.options.contact)
+        return DrapeCase(rest, self.fabric, batch.surface, self.options.contact)
 
     def _scaled(
         self, sample: WornSample, skinned: Tensor, vertices: Tensor, batch: PosedBatch, stiffness: float
     ) -> dict[str, Tensor]:
         case = self.case(sample, batch)
         terms = drape_energies(
-            vertices, case.rest, self.fabric, case.body.gap(vertices), case.contact, stiffness=stiffness
+            vertices, case.rest, self.fabric, batch.surface, case.contact, stiffness=stiffness
         )
         reference = reference_energy(case.rest)
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")

@@ -10,11 +10,12 @@ Implicit Sewing Patterns", NeurIPS 2023, Eq. 8.
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.conventions import GRAVITY
-from isp_assets.geometry.contact import Gap
+from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.energy import ClothRest, Fabric, bending_energy, gravity_energy, membrane_energy
 
 _REFERENCE_LIFT = 0.05  # energies are compared with that of lifting the garment this far [m]
@@ -22,7 +23,7 @@ _REFERENCE_LIFT = 0.05  # energies are compared with that of lifting the garment
 
 @dataclass(frozen=True)
 class Contact:
-    """Penalty for coming nearer to the body than ``margin``, and for reaching into another part of it."""
+    """Penalty for coming nearer to the body than ``margin``."""
 
     margin: float = 0.007
     """Clearance to keep at the vertices [m]; edges between them cut across curved skin."""
@@ -42,31 +43,19 @@ class Contact:
 
 
 def drape_energies(
-    vertices: Float[Tensor, "T V 3"], rest: ClothRest, fabric: Fabric, gap: Gap, contact: Contact,
+    vertices: Float[Tensor, "T V 3"], rest: ClothRest, fabric: Fabric, body: Surface, contact: Contact,
     *, stiffness: float,
 ) -> dict[str, Float[Tensor, " T"]]:  # fmt: skip
-    """The terms of Eq. 8 [J]: strain, bending, gravity, collision.
-
-    Args:
-        vertices: Positions [m].
-        rest: Rest metric and masses.
-        fabric: Stiffness.
-        gap: Where ``vertices`` are over the skin.
-        contact: How contact counts.
-        stiffness: Of the contact, at this time of the training [1/s²].
-    """
-
-    def penalty(depth: Float[Tensor, "T V"]) -> Float[Tensor, " T"]:
-        near = depth.clamp_max(contact.depth)
-        cost = contact.cubic * near.pow(3) + 0.5 * stiffness * rest.mass * near.square()
-        slope = 3 * contact.cubic * contact.depth**2 + stiffness * rest.mass * contact.depth
-        return (cost + slope * (depth - near)).sum(-1)
-
+    """The terms of Eq. 8 [J]: strain, bending, gravity, collision."""
+    lacking = torch.relu(contact.margin - clearance(vertices, body))
+    near = lacking.clamp_max(contact.depth)
+    penalty = contact.cubic * near.pow(3) + 0.5 * stiffness * rest.mass * near.square()
+    slope = 3 * contact.cubic * contact.depth**2 + stiffness * rest.mass * contact.depth
     return {
         "strain": membrane_energy(vertices, rest, fabric),
         "bending": bending_energy(vertices, rest, fabric),
         "gravity": gravity_energy(vertices, rest),
-        "collision": penalty(gap.lacking(contact.margin)) + penalty(gap.exceeding()),
+        "collision": (penalty + slope * (lacking - near)).sum(-1),
     }
 
 

@@ -1,14 +1,14 @@
 """How well a garment is draped: energies, strain, penetration, and the distance to the true minimum."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from isp_assets.geometry.contact import Gap
+from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.energy import ClothRest, Fabric
 from isp_assets.geometry.grading import face_strain
 from isp_assets.train.drape_energy import Contact, drape_energies
@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 _GAP_POSES = 2
 
 
-@runtime_checkable
-class Skin(Protocol):
-    """What a garment lies on, in T poses."""
-
-    def gap(self, vertices: Float[Tensor, "T V 3"]) -> Gap:
-        """Where vertices are over it."""
-
-    def frame(self, index: int) -> "Skin":
-        """One pose alone, in double precision."""
-
-
 @dataclass(frozen=True, eq=False)
 class DrapeCase:
     """One garment on one body in T poses."""
@@ -37,30 +26,27 @@ class DrapeCase:
     rest: ClothRest
     """Graded to the body."""
     fabric: Fabric
-    body: Skin
+    body: Surface
     contact: Contact
 
     def energies(self, vertices: Float[Tensor, "T V 3"]) -> dict[str, Float[Tensor, " T"]]:
         """The terms of Eq. 8 [J] at the stiffness of the end of training."""
         return drape_energies(
-            vertices,
-            self.rest,
-            self.fabric,
-            self.body.gap(vertices),
-            self.contact,
-            stiffness=self.contact.stiffness,
+            vertices, self.rest, self.fabric, self.body, self.contact, stiffness=self.contact.stiffness
         )
 
     def frame(self, index: int) -> "DrapeCase":
         """One pose alone, in double precision."""
-        return DrapeCase(self.rest.to(dtype=torch.float64), self.fabric, self.body.frame(index), self.contact)
+        one = slice(index, index + 1)
+        body = Surface(self.body.points[one].double(), self.body.normals[one].double())
+        return DrapeCase(self.rest.to(dtype=torch.float64), self.fabric, body, self.contact)
 
 
 def measure_drape(case: DrapeCase, vertices: Float[Tensor, "T V 3"], *, prefix: str) -> dict[str, float]:
     """Means over the poses: energies [mJ], 99th percentile of the strain, vertices inside the body [%]."""
     figures = {f"{name}_mj": 1e3 * float(value.mean()) for name, value in case.energies(vertices).items()}
     figures["strain_p99"] = float(face_strain(vertices, case.rest).quantile(0.99, dim=1).mean())
-    figures["inside_percent"] = 100 * float((case.body.gap(vertices).height < 0).float().mean())
+    figures["inside_percent"] = 100 * float((clearance(vertices, case.body) < 0).float().mean())
     return {prefix + name: value for name, value in figures.items()}
 
 

@@ -24,8 +24,7 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
-from isp_assets.geometry.part_contact import PartSamples, PosedParts
+from isp_assets.geometry.obstacle import Obstacle
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
@@ -99,8 +98,6 @@ class LayeringTask:
         }  # fmt: skip
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
-        mesh = CollisionMesh.build(body.faces.cpu().numpy(), body.weights.cpu().numpy())
-        self.samples = PartSamples.of_mesh(mesh).to(self.device)
         self.module = LayeringNet(options.network).to(self.device)
         wardrobe = WardrobeOptions(
             garments=options.garments, edge_length=options.edge_length, map_size=options.network.map_size
@@ -153,11 +150,10 @@ class LayeringTask:
         options, contact = self.options, self.options.contact
         bound = stack.wearer.bound
         rest = graded_rest(stack.wearer.rest, bound.canonical, shape_garment(bound, stack.betas))
-        skin = PosedParts(stack.posed.vertices, self.body.faces, self.samples).beneath(stack.wearer.parts)
-        terms = drape_energies(vertices, rest, self.fabric, skin.gap(vertices), contact, stiffness=stiffness)
+        terms = drape_energies(vertices, rest, self.fabric, stack.beneath[0], contact, stiffness=stiffness)
         with torch.no_grad():
             before = drape_energies(
-                stack.draped, rest, self.fabric, skin.gap(stack.draped), contact, stiffness=stiffness
+                stack.draped, rest, self.fabric, stack.beneath[0], contact, stiffness=stiffness
             )
         layers = vertices.new_zeros(len(vertices))
         for surface in stack.beneath[1:]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import Body, PosedBody
@@ -36,8 +36,6 @@ class Wearer:
     ramp: Float[Tensor, " V"]
     field: DrapeField | None
     displacement: BoundDisplacement | None
-    parts: Bool[Tensor, "V 6"]
-    """Which body parts each vertex belongs to."""
     layering: BoundLayering
     collision: CollisionMesh
 
@@ -82,7 +80,6 @@ def build_wearers(
                 ramp=sample.ramp[:, 0].to(device),
                 field=field,
                 displacement=displacement,
-                parts=sample.parts.to(device),
                 layering=bind_layering(network, sample.garment, sample.sampler, device=device),
                 collision=CollisionMesh.build(sample.garment.faces, sample.bound.joint_weights.cpu().numpy()),
             )
