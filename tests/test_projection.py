@@ -110,23 +110,39 @@ def test_contact_deep_inside_another_body_part_is_left_alone() -> None:
     assert not done.ran
 
 
+def _body(own: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], part: int) -> Obstacle:
+    """Two shapes as one body: a part by its number in the order of the parts, and the torso."""
+    vertices = np.concatenate([own[0], other[0]])
+    mesh = collision((vertices, np.concatenate([own[1], other[1] + len(own[0])])))
+    is_own = np.arange(len(vertices)) < len(own[0])
+    parts = np.zeros_like(mesh.parts)
+    parts[is_own, part] = parts[~is_own, 0] = True
+    faces_of = [np.flatnonzero(parts[mesh.topology.faces][:, :, k].any(1)) for k in range(6)]
+    return Obstacle(type(mesh)(mesh.topology, parts, tuple(faces_of)), vertices, margin=0.003)
+
+
 @pytest.mark.parametrize(("radius", "centre"), [(0.04, 0.137), (0.065, 0.137)])
 def test_room_above_the_own_part_is_used_to_clear_another_part(radius: float, centre: float) -> None:
     """A sleeve around its arm cuts the torso by 3 mm and by 28 mm: there is room nearer to the arm."""
     sleeve = tube(radius, low=-0.03, high=0.03)
-    arm = tube(0.03)
     torso = ball(centre=(centre, 0, 0))
-    body_shape = (np.concatenate([arm[0], torso[0]]), np.concatenate([arm[1], torso[1] + len(arm[0])]))
-    both = collision(body_shape)
-    is_arm = np.arange(len(body_shape[0])) < len(arm[0])
-    parts = np.zeros_like(both.parts)
-    parts[is_arm, 2] = parts[~is_arm, 0] = True
-    faces_of = [np.flatnonzero(parts[both.topology.faces][:, :, k].any(1)) for k in range(6)]
-    body = Obstacle(type(both)(both.topology, parts, tuple(faces_of)), body_shape[0], margin=0.003)
+    body = _body(tube(0.03), torso, 2)
     assert len(crossing_pairs(*sleeve, *torso)) > 0
     done = project(sleeve[0], collision(sleeve, LEFT_ARM), [body])
     assert len(crossing_pairs(done.vertices, sleeve[1], *torso)) == 0
     assert np.linalg.norm(done.vertices[:, [0, 2]], axis=1).min() > 0.0325
+
+
+def test_triangles_that_reach_into_another_part_are_drawn_in_with_it() -> None:
+    """A fist pushes a coarse shirt, 3 cm off the torso, down to it: the sides of the dent clear the fist."""
+    shirt, torso, centre = sheet(9, height=0.03), sheet(41), (0.004, 0.06, 0.003)
+    fist = ball(0.05, centre=centre)
+    body = _body(fist, torso, 2)
+    assert len(crossing_pairs(*shirt, *fist)) > 50
+    done = project(shirt[0], collision(shirt), [body])
+    assert _heights(done.vertices, obstacle(torso)).min() > 0.0028
+    assert len(crossing_pairs(done.vertices, shirt[1], *fist)) == 0
+    assert np.linalg.norm(done.vertices[shirt[1]].mean(axis=1) - centre, axis=1).min() > 0.0525
 
 
 def test_places_without_room_are_named_and_no_vertex_is_thrown_about() -> None:

@@ -11,8 +11,21 @@ from jaxtyping import Bool, Float, Int
 
 from isp_assets.geometry.closest import Closest
 from isp_assets.geometry.draw_in import draw_in
-from isp_assets.geometry.lifts import ASIDE, WATCHED, Neighbour, open_beneath, shortest_way, towards
+from isp_assets.geometry.lifts import (
+    ASIDE,
+    WATCHED,
+    Neighbour,
+    any_corner,
+    open_beneath,
+    shortest_way,
+    towards,
+)
+from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.geometry.spread import keep_larger
+
+_SAMPLES = np.array([[1 / 3] * 3, [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]])
+"""Places on a triangle that must be clear besides its corners."""
+_SHORTEST_WAY = 1e-4  # below this [m] there is no room to draw anything in
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,51 +41,40 @@ class Ways:
 
 
 def leave_other_parts(
-    position: Float[np.ndarray, "V 3"],
-    parts: Bool[np.ndarray, "V 6"],
-    near: Sequence[Neighbour],
-    ways: Ways,
+    position: Float[np.ndarray, "V 3"], mesh: CollisionMesh, near: Sequence[Neighbour], ways: Ways
 ) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
     """Draw in what touches another part; where there is no room for that, lift it by what there is.
 
+    Between a corner that is drawn in and one that hangs free, as cloth does behind a pressed arm,
+    a triangle would still touch: its corners are drawn in together until it is clear as well.
+
     Args:
         position: The garment [m].
-        parts: Which body parts each vertex belongs to.
+        mesh: Its collision data.
         near: Every inner garment from the outermost in, then the body.
         ways: Where the vertices may go.
 
     Returns:
         The moves [m], and the vertices that touch another part.
     """
-    lift, touched = np.zeros_like(position), np.zeros_like(parts)
     if near[0].other is None:
-        _look(position, parts, near)
-    for neighbour in near:
-        assert neighbour.other is not None
-        index = np.flatnonzero(neighbour.watched_other)
-        found = _touch(position[index], neighbour.other[index], neighbour)
-        margin = np.full(len(index), neighbour.obstacle.margin)
-        touching = found.height < margin
-        touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
-        reach = np.full(len(index), ways.foreign_reach)
-        keep_larger(lift, shortest_way(position[index], found, margin, reach), index)
-    size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
-    lift *= np.minimum(1, ways.room / np.maximum(size, 1e-9))[:, None]
-    touched &= ~parts
+        _look(position, mesh.parts, near)
+    lift, touched = _shallow(position, mesh.parts, near, ways)
     pressed: Bool[np.ndarray, " V"] = np.asarray(touched.any(axis=1))
-    index = np.flatnonzero(pressed & np.isfinite(ways.room) & (ways.room > 0))
-    skin = near[-1].obstacle.contacts(position[index], parts[index], within=ASIDE)
-    inwards = towards(position[index], skin)
-    known = inwards.any(1)
-    index, inwards = index[known], inwards[known]
-    if len(index):
-        moves, clear = draw_in(
-            position[index], inwards, ways.room[index],
-            lambda points, rows: _clearance(points, touched[index[rows]], index[rows], near),
-        )  # fmt: skip
-        known = clear | (ways.room[index] < ways.reach)
-        lift[index[known]] = moves[known]
-    return lift, pressed
+    caught = mesh.topology.faces[any_corner(pressed, mesh.topology.faces)]
+    index = np.unique(caught)
+    skin = near[-1].obstacle.contacts(position[index], mesh.parts[index], within=ASIDE)
+    way = np.zeros_like(position)
+    room = np.where(np.isfinite(ways.room), ways.room, 0)[index]
+    way[index] = room[:, None] * towards(position[index], skin)
+    own = np.flatnonzero(pressed & way.any(axis=1))
+    share, clear = _draw(position[own], way[own], own[:, None], touched, near)
+    known = clear | (ways.room[own] < ways.reach)
+    lift[own[known]] = (share[:, None] * way[own])[known]
+    size = np.maximum(np.sqrt(np.einsum("vc,vc->v", way, way)), 1e-9)
+    left = np.minimum(size, ways.reach) - np.einsum("vc,vc->v", lift, way) / size
+    way *= (left / size).clip(0, 1)[:, None]
+    return lift + _draw_faces(position + lift, way, caught, touched, near), pressed
 
 
 def _look(
@@ -87,17 +89,73 @@ def _look(
         open_parts = open_beneath(open_parts, neighbour.obstacle, found)
 
 
-def _clearance(
-    points: Float[np.ndarray, "n 3"],
-    parts: Bool[np.ndarray, "n 6"],
-    rows: Int[np.ndarray, " n"],
-    near: Sequence[Neighbour],
-) -> Float[np.ndarray, " n"]:
-    """How far points are above the margins over some parts [m]; negative where they touch."""
-    least = np.full(len(points), np.inf)
+def _shallow(
+    position: Float[np.ndarray, "V 3"], parts: Bool[np.ndarray, "V 6"], near: Sequence[Neighbour], ways: Ways
+) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, "V 6"]]:
+    """The shortest ways out of shallow contact, as far as there is room; and which parts are touched."""
+    lift, touched = np.zeros_like(position), np.zeros_like(parts)
     for neighbour in near:
         assert neighbour.other is not None
-        found = _touch(points, parts & neighbour.other[rows], neighbour)
+        index = np.flatnonzero(neighbour.watched_other)
+        found = _touch(position[index], neighbour.other[index], neighbour)
+        margin = np.full(len(index), neighbour.obstacle.margin)
+        touching = found.height < margin
+        touched[index[touching]] |= neighbour.obstacle.parts_at(found.face[touching])
+        reach = np.full(len(index), ways.foreign_reach)
+        keep_larger(lift, shortest_way(position[index], found, margin, reach), index)
+    size = np.sqrt(np.einsum("vc,vc->v", lift, lift))
+    return lift * np.minimum(1, ways.room / np.maximum(size, 1e-9))[:, None], touched & ~parts
+
+
+def _draw_faces(
+    position: Float[np.ndarray, "V 3"],
+    way: Float[np.ndarray, "V 3"],
+    caught: Int[np.ndarray, "F 3"],
+    touched: Bool[np.ndarray, "V 6"],
+    near: Sequence[Neighbour],
+) -> Float[np.ndarray, "V 3"]:
+    """Moves along the corners' ways after which centres of faces and edges are clear too."""
+    points = np.einsum("qk,fkc->fqc", _SAMPLES, position[caught]).reshape(-1, 3)
+    ways = np.einsum("qk,fkc->fqc", _SAMPLES, way[caught]).reshape(-1, 3)
+    corners = np.repeat(caught, len(_SAMPLES), axis=0)
+    rows = np.flatnonzero(np.einsum("nc,nc->n", ways, ways) > _SHORTEST_WAY**2)
+    rows = rows[_clearance(points[rows], corners[rows], touched, near) < 0]
+    share, _ = _draw(points[rows], ways[rows], corners[rows], touched, near)
+    most = np.zeros(len(position))
+    used = _SAMPLES[rows % len(_SAMPLES)] > 0
+    np.maximum.at(most, corners[rows][used], np.broadcast_to(share[:, None], used.shape)[used])
+    return most[:, None] * way
+
+
+def _draw(
+    points: Float[np.ndarray, "n 3"],
+    way: Float[np.ndarray, "n 3"],
+    corners: Int[np.ndarray, "n k"],
+    touched: Bool[np.ndarray, "V 6"],
+    near: Sequence[Neighbour],
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Share of its way that each point must go, all of it where that is not enough; and where it is."""
+    size = np.sqrt(np.einsum("nc,nc->n", way, way))
+    if len(points) == 0:
+        return size, np.zeros(0, bool)
+    moves, clear = draw_in(
+        points, way / size[:, None], size,
+        lambda places, rows: _clearance(places, corners[rows], touched, near),
+    )  # fmt: skip
+    return np.sqrt(np.einsum("nc,nc->n", moves, moves)) / size, clear
+
+
+def _clearance(
+    points: Float[np.ndarray, "n 3"],
+    corners: Int[np.ndarray, "n k"],
+    touched: Bool[np.ndarray, "V 6"],
+    near: Sequence[Neighbour],
+) -> Float[np.ndarray, " n"]:
+    """How far points are above the margins over the parts that their vertices touch [m]; negative inside."""
+    least, parts = np.full(len(points), np.inf), touched[corners].any(axis=1)
+    for neighbour in near:
+        assert neighbour.other is not None
+        found = _touch(points, parts & neighbour.other[corners].any(axis=1), neighbour)
         least = np.minimum(least, found.height - neighbour.obstacle.margin)
     return least
 

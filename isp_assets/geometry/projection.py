@@ -235,7 +235,7 @@ class _Projector:
         if not foreign:
             return own
         ways = Ways(room, self.options.reach, self.options.foreign_reach)
-        other, pressed = leave_other_parts(self.position, self.mesh.parts, self.near, ways)
+        other, pressed = leave_other_parts(self.position, self.mesh, self.near, ways)
         self.pressed |= pressed
         return np.where((own != 0).any(1, keepdims=True), own, other)
 
