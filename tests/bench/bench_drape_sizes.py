@@ -111,28 +111,29 @@ def draw(rows: list[dict[str, Any]], path: Path, title: str) -> None:
     """Energy removed over the number of weights, and the time of a frame beside it."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 4), layout="constrained")
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     trained = [row for row in rows if row["steps"]]
     size = [row["parameters"] / 1e6 for row in trained]
-    left.plot(size, [row["removed_mj"] for row in trained], marker="o")
+    left.plot(size, [row["removed_mj"] for row in trained], color="0.7", zorder=1)
     for row, x in zip(trained, size, strict=True):
-        note = f"{row['size']}\n{row['steps']} steps"
-        left.annotate(note, (x, row["removed_mj"]), xytext=(5, -20), textcoords="offset points", fontsize=7)
+        left.scatter(x, row["removed_mj"], label=f"{row['size']}: {row['steps']} steps", zorder=2)
     for row in rows:
         if not row["steps"]:
-            left.axhline(row["removed_mj"], linestyle="--", color="0.5")
-            left.annotate(row["size"], (min(size), row["removed_mj"]), xytext=(0, 3),
-                          textcoords="offset points", fontsize=7)  # fmt: skip
-    left.set(xscale="log", xlabel="million weights", ylabel=MEANINGS["removed_mj"], title=title)
+            left.axhline(row["removed_mj"], linestyle="--", color="0.5", label=row["size"])
+    left.set(
+        xscale="log", xlabel="million weights", ylabel="energy removed, held-out poses [mJ]", title=title
+    )
     left.set_ylim(0, None)
-    for key in ("map_ms", "bound_ms"):
-        right.plot(size, [row[key] for row in trained], marker="o", label=MEANINGS[key])
-    right.set(xscale="log", yscale="log", xlabel="million weights", ylabel="ms", title="A frame")
+    left.legend(fontsize=8, loc="lower left")
+    for key, label in (("map_ms", "map made in every frame"), ("bound_ms", "maps sampled once a garment")):
+        right.plot(size, [row[key] for row in trained], marker="o", label=label)
+    right.set(
+        xscale="log", yscale="log", xlabel="million weights", ylabel="ms", title="A frame of one garment"
+    )
+    right.legend(fontsize=8)
     for axes in (left, right):
-        axes.margins(x=0.25, y=0.15)
         axes.grid(alpha=0.3)
-    right.legend(fontsize=7)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
