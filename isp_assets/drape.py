@@ -13,7 +13,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from isp_assets.body import PosedBody
 from isp_assets.clearing import Calm, clear_layer
-from isp_assets.conventions import FrameRange
+from isp_assets.conventions import NUM_JOINTS, FrameRange
 from isp_assets.displacement import displace, displacements
 from isp_assets.drape_features import drape_features
 from isp_assets.dressing import WornGarment, dress
@@ -31,11 +31,11 @@ from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions
-from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.outfit import Outfit
 from isp_assets.shot import DEFAULT_RESOLUTION, Shot
 from isp_assets.skinning import skin_garment
+from isp_assets.tucking import Tucking
 
 STEPS = ("skin", "displace", "tuck", "layering", "project")
 
@@ -107,6 +107,7 @@ class _Draper:
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
         self.worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
+        self.tucking = self._tucking() if "tuck" in options.steps and len(self.worn) > 1 else None
         self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
         self.scene = Scene(
@@ -116,6 +117,19 @@ class _Draper:
             frames=FrameRange(int(numbers[0]), int(numbers[-1]), shot.motion.frame_step),
             fps=shot.motion.fps,
         )
+
+    @torch.no_grad()
+    def _tucking(self) -> Tucking:
+        """Find what is tucked in at rest; there cloth may crumple."""
+        posed = self.body.pose(torch.zeros(1, NUM_JOINTS, 3, device=self.options.device), betas=self.betas)
+        rest = [skin_garment(worn.skin, posed, self.betas)[0][0] for worn in self.worn]
+        skin = Obstacle(self.body_collision, posed.vertices[0].cpu().numpy(), margin=self.options.body_margin)
+        tucking = Tucking(self.worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
+        self.worn = tuple(
+            replace(worn, stretch=worn.stretch.loosened(hidden.share > 0))
+            for worn, hidden in zip(self.worn, tucking.hidden, strict=True)
+        )
+        return tucking
 
     def chunks(self) -> Iterator[FrameChunk]:
         for start in range(0, len(self.shot.motion), self.options.chunk):
@@ -169,24 +183,17 @@ class _Draper:
 
     def _tuck(self, layers: list[Float[Tensor, "T _ 3"]], state: "_ChunkState") -> None:
         """Let wide inner layers give way to held layers over them; replaces entries of ``layers``."""
-        if "tuck" in self.options.steps and len(layers) > 1:
+        if self.tucking is not None:
             with state.timed("tuck"):
                 layers[:] = [vertices.clone() for vertices in layers]
-                for t in range(len(layers[0])):
-                    self._tuck_frame(layers, t, state)
+                for t, beneath in enumerate(state.obstacles):
+                    before = [vertices[t].cpu().numpy().astype(np.float64) for vertices in layers]
+                    for index, after in enumerate(self.tucking.frame(before, beneath[0])):
+                        if after is not before[index]:
+                            layers[index][t] = torch.as_tensor(after).to(layers[index])
+                            state.steps[index][t].append("tuck")
         for vertices in layers:
             state.keep("tuck", vertices, self.options.keep_stages)
-
-    def _tuck_frame(self, layers: list[Float[Tensor, "T _ 3"]], t: int, state: "_ChunkState") -> None:
-        covers: list[Obstacle] = []
-        for index in reversed(range(len(layers))):
-            worn, before = self.worn[index], layers[index][t].cpu().numpy().astype(np.float64)
-            after = tuck(before, worn.collision, covers)
-            if after is not before:
-                layers[index][t] = torch.as_tensor(after).to(layers[index])
-                state.steps[index][t].append("tuck")
-            if len(worn.layer.garment.anchors):  # what the body holds cannot give way; all else is lifted
-                covers.append(Obstacle(worn.collision, after, margin=0.0))
 
     def _settle(
         self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"

@@ -11,6 +11,7 @@ from isp_assets.collection import Collection
 from isp_assets.conventions import FrameRange
 from isp_assets.drape import STEPS, DrapeOptions, drape
 from isp_assets.errors import DrapeError
+from isp_assets.evaluate.frames import FrameMeter
 from isp_assets.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from isp_assets.motion import Motion
 from isp_assets.outfit import Outfit
@@ -108,6 +109,20 @@ def test_projection_moves_nothing_far(outfit: Outfit, shot: Shot) -> None:
     (chunk,) = list(drape(outfit, shot, replace(QUICK, keep_stages=True)))
     for before, after in zip(chunk.stages["layering"], chunk.layers, strict=True):
         assert np.linalg.norm(after - before, axis=-1).max() < 0.08
+
+
+def test_a_tucked_shirt_stays_in_the_trousers_when_the_hips_bend(body: Body) -> None:
+    """A hand's breadth into the built-in squat the hem stays beneath, and does not blow the trousers up."""
+    outfit = Collection.load("default").outfit(["long_sleeved_shirt", "trousers"])
+    motion = Motion.load("squat")
+    depth = motion.translation[0, 1] - motion.translation[:, 1]
+    frame = int(motion.frames[np.argmax(depth > 0.1)])
+    draped = drape(
+        outfit, Shot("squat", body, motion.select(FrameRange(frame, frame))), DrapeOptions(resolution=64)
+    )
+    figures = FrameMeter(draped.scene).measure(next(iter(draped)), 0)
+    assert figures["final/L01_trousers/inner_area_percent"] < 0.1
+    assert figures["final/L01_trousers/strain_p99"] < 0.3
 
 
 def test_wrong_options_and_body(outfit: Outfit, shot: Shot) -> None:

@@ -5,7 +5,7 @@ import pytest
 from collision_shapes import LEFT_ARM, collision, obstacle, tube
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.tuck import GIVE, tuck
+from isp_assets.geometry.tuck import GIVE, Hidden, press, tuck
 
 
 def _radius(vertices: np.ndarray) -> np.ndarray:
@@ -43,3 +43,29 @@ def test_negative_give_is_refused() -> None:
     inner = tube(0.1)
     with pytest.raises(GeometryError, match="give"):
         tuck(inner[0], collision(inner), [], give=-1.0)
+
+
+def test_what_stands_out_of_its_cover_at_rest_is_hidden_and_what_has_room_is_not() -> None:
+    body, trousers = obstacle(tube(0.09, low=-0.5, high=0.5)), tube(0.1, low=-0.4, high=0.0)
+    shirt = tube(0.12, low=-0.3, high=0.3)
+    hidden = Hidden.at_rest(shirt[0], collision(shirt), [obstacle(trousers)], body)
+    under = (shirt[0][:, 1] < -0.07) & (shirt[0][:, 1] > -0.33)
+    assert (hidden.share[under] > 0.99).all()
+    assert (hidden.share[shirt[0][:, 1] > 0.01] == 0).all()
+    np.testing.assert_allclose(hidden.height[under], 0.01, atol=1.5e-3)  # the cover lies a centimetre up
+    vest = tube(0.094, low=-0.3, high=0.3)
+    roomy = obstacle(tube(0.12, low=-0.4, high=0.0))
+    assert not Hidden.at_rest(vest[0], collision(vest), [roomy], body).share.any()
+    assert not Hidden.at_rest(shirt[0], collision(shirt), [], body).share.any()
+
+
+def test_hidden_cloth_is_pressed_in_to_where_its_cover_lies() -> None:
+    body, trousers = obstacle(tube(0.09, low=-0.5, high=0.5)), tube(0.1, low=-0.4, high=0.0)
+    shirt = tube(0.12, low=-0.3, high=0.3)
+    hidden = Hidden.at_rest(shirt[0], collision(shirt), [obstacle(trousers)], body)
+    pressed = _radius(press(shirt[0], collision(shirt), hidden, body))
+    under = shirt[0][:, 1] < -0.07
+    np.testing.assert_allclose(pressed[under], 0.1, atol=1.5e-3)
+    np.testing.assert_allclose(pressed[shirt[0][:, 1] > 0.01], 0.12, atol=1e-9)
+    nothing = Hidden(np.zeros(len(shirt[0])), hidden.height)
+    assert press(shirt[0], collision(shirt), nothing, body) is shirt[0]

@@ -11,7 +11,7 @@ Reference: Bouaziz et al., "Projective Dynamics: Fusing Constraint Projections f
 Simulation", ACM Transactions on Graphics 33(4), 2014.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,6 +23,9 @@ from isp_assets.geometry.energy import ClothRest
 
 STRETCH_LIMIT = 0.06
 """Largest relative change of length that is left as it is."""
+
+CRUMPLED = 0.75
+"""Share of its size to which hidden cloth may shrink, as a mesh shows folds that are too small for it."""
 
 _FOLLOW = 0.05  # distance over which a correction spreads in one step [m]
 _HELD = 1e6  # weight of a held vertex, relative to a free one
@@ -36,6 +39,8 @@ class StretchLimit:
     inverse_rest: Float[np.ndarray, "F 2 2"]
     """Inverse of the flat edge matrix of every face [1/m]."""
     limit: float
+    least: Float[np.ndarray, " F"]
+    """Smallest stretch of every face that is left as it is."""
     gradient: csr_array
     """[2 F, V]: positions to the two columns of every face's deformation gradient."""
     weighted: csr_array
@@ -69,7 +74,13 @@ class StretchLimit:
         system = csc_array(weighted @ gradient + diags_array(inertia))
         options = {"SymmetricMode": True}
         solver = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-        return cls(faces, inverse, limit, gradient, weighted, inertia, solver)
+        least = np.full(len(faces), 1 - limit)
+        return cls(faces, inverse, limit, least, gradient, weighted, inertia, solver)
+
+    def loosened(self, crumpled: Bool[np.ndarray, " V"], *, least: float = CRUMPLED) -> "StretchLimit":
+        """The same, with cloth at some vertices free to shrink to ``least`` of its size: to crumple."""
+        faces = crumpled[self.faces].any(axis=1)
+        return replace(self, least=np.where(faces, np.minimum(self.least, least), self.least))
 
     def ease(self, vertices: Float[np.ndarray, "V 3"], *, steps: int) -> Float[np.ndarray, "V 3"]:
         """Positions after some steps; the array that came in, if no face is strained beyond the limit."""
@@ -88,8 +99,8 @@ class StretchLimit:
         middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
         spread = np.sqrt(half * half + xy * xy)
         high, low = np.sqrt(middle + spread), np.sqrt((middle - spread).clip(1e-12))
-        first = high.clip(1 - self.limit, 1 + self.limit) / np.maximum(high, 1e-6)
-        second = low.clip(1 - self.limit, 1 + self.limit) / np.maximum(low, 1e-6)
+        first = high.clip(self.least, 1 + self.limit) / np.maximum(high, 1e-6)
+        second = low.clip(self.least, 1 + self.limit) / np.maximum(low, 1e-6)
         # Clipping factors (first, second) along the principal axes, as a symmetric 2x2 matrix.
         turn_cos, turn_sin = half / np.maximum(spread, 1e-12), xy / np.maximum(spread, 1e-12)
         mean, difference = 0.5 * (first + second), 0.5 * (first - second)

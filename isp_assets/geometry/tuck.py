@@ -3,12 +3,15 @@
 The layering network and the projection move outer garments only. Where an inner
 garment hangs far outside an outer one (the wide hem of a shirt worn inside trousers),
 that would blow the outer one up. There the inner one gives way: it is drawn in until
-it stands out by no more than ``give``, and its neighbourhood follows smoothly.
+it stands out by no more than ``give``, and its neighbourhood follows smoothly. Where a pose
+creases both, nobody can tell from there what belongs beneath what: cloth that stands out of a
+cover at rest is pressed in to where that lay, over the body.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a time.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +28,8 @@ _REACH = 0.12  # garments further apart than this [m] have nothing to do with on
 _RINGS, _DECAY = 24, 0.98  # rings of neighbours that follow, and how much of it: over some ten centimetres
 _BORDER_RINGS = 2.0  # edges from a cover's border at which its pull is firm
 _SURE = (0.3, 0.7)  # cosines between which a pull becomes firm
+_OVER_BODY = 0.004  # least height over the body [m] to which hidden cloth is pressed
+_EASY = 0.01  # cloth further than this [m] beneath its cover at rest needs no pressing
 
 
 def tuck(
@@ -70,6 +75,75 @@ def tuck(
     held = np.where((firm >= 1)[:, None], pull, 0.0)
     followed = spread(held, mesh.neighbour_average, rings=_RINGS, decay=_DECAY)
     return vertices + firm[:, None] * pull + (1 - firm[:, None]) * followed
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Cloth that is hidden beneath covers although it has no room there at rest."""
+
+    share: Float[np.ndarray, " V"]
+    """How far each vertex is pressed: 0 not at all, 1 wholly."""
+    height: Float[np.ndarray, " V"]
+    """Height over the body to which it is pressed: that of its cover at rest [m]."""
+
+    @classmethod
+    def at_rest(
+        cls,
+        vertices: Float[np.ndarray, "V 3"],
+        mesh: CollisionMesh,
+        covers: Sequence[Obstacle],
+        body: Obstacle,
+    ) -> "Hidden":
+        """Find what stands out of its covers, and how high these lie.
+
+        Args:
+            vertices: The inner garment at rest on the body [m].
+            mesh: Its collision data.
+            covers: The garments worn over it, in the same pose.
+            body: The skin, in the same pose.
+        """
+        points = np.ascontiguousarray(vertices, np.float64)
+        share, height = np.zeros(len(points)), np.full(len(points), _OVER_BODY)
+        above = body.contacts(points, mesh.parts, within=_REACH).height
+        normals = SurfaceNormals(points, mesh.topology.faces).of_vertices
+        for cover in covers:
+            found = cover.contacts(points, mesh.parts, within=_REACH)
+            near = ~found.on_border & (np.abs(found.height) < _REACH) & np.isfinite(above)
+            inside = (cover.border_rings_at(found) / _BORDER_RINGS).clip(0, 1)
+            low, high = _SURE
+            alike = ((np.einsum("vc,vc->v", normals, found.normal) - low) / (high - low)).clip(0, 1)
+            crowded = (1 + np.where(near, found.height, -np.inf) / _EASY).clip(0, 1)
+            here = inside * alike * crowded
+            lower = np.where(near, above - found.height, 0.0).clip(_OVER_BODY)
+            height = np.where(here > share, lower, height)
+            share = np.maximum(share, here)
+        return cls(share, height)
+
+
+def press(
+    vertices: Float[np.ndarray, "V 3"], mesh: CollisionMesh, hidden: Hidden, body: Obstacle
+) -> Float[np.ndarray, "V 3"]:
+    """Draw hidden cloth in to where its cover lies at rest.
+
+    Args:
+        vertices: The garment in this frame [m].
+        mesh: Its collision data.
+        hidden: Which of its cloth is hidden.
+        body: The skin in this frame.
+
+    Returns:
+        New positions [m]; the same array where nothing is hidden.
+    """
+    index = np.flatnonzero(hidden.share)
+    if len(index) == 0:
+        return vertices
+    points = np.ascontiguousarray(vertices[index], np.float64)
+    found = body.contacts(points, mesh.parts[index], within=_REACH)
+    above = np.isfinite(found.height) & (found.height > hidden.height[index])
+    way = hidden.share[index] * (1 - hidden.height[index] / np.where(above, found.height, 1.0))
+    result = vertices.copy()
+    result[index] += np.where(above[:, None], way[:, None] * (found.point - points), 0.0)
+    return result
 
 
 def _firmness(
