@@ -13,7 +13,7 @@ Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -105,9 +105,10 @@ class _Draper:
         self.shot, self.options = shot, options
         self.body = shot.body.to(options.device)
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
-        self.worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
+        worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
-        self.tucking = self._tucking() if "tuck" in options.steps and len(self.worn) > 1 else None
+        self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
+        self.worn = self.tucking.worn if self.tucking else worn
         self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
         self.scene = Scene(
@@ -119,17 +120,12 @@ class _Draper:
         )
 
     @torch.no_grad()
-    def _tucking(self) -> Tucking:
-        """Find what is tucked in at rest; there cloth may crumple."""
+    def _tucking(self, worn: tuple[WornGarment, ...]) -> Tucking:
+        """Find what is tucked in at rest."""
         posed = self.body.pose(torch.zeros(1, NUM_JOINTS, 3, device=self.options.device), betas=self.betas)
-        rest = [skin_garment(worn.skin, posed, self.betas)[0][0] for worn in self.worn]
+        rest = [skin_garment(garment.skin, posed, self.betas)[0][0] for garment in worn]
         skin = Obstacle(self.body_collision, posed.vertices[0].cpu().numpy(), margin=self.options.body_margin)
-        tucking = Tucking(self.worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
-        self.worn = tuple(
-            replace(worn, stretch=worn.stretch.loosened(hidden.share > 0))
-            for worn, hidden in zip(self.worn, tucking.hidden, strict=True)
-        )
-        return tucking
+        return Tucking(worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
 
     def chunks(self) -> Iterator[FrameChunk]:
         for start in range(0, len(self.shot.motion), self.options.chunk):

@@ -8,6 +8,7 @@ Positions are in metres; NumPy, one frame at a time.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -30,14 +31,17 @@ class Tucking:
             rest: Each of them at rest on the wearer, all in one pose.
             body: The skin in that pose.
         """
-        self._worn = tuple(worn)
         covers: list[Obstacle] = []
         hidden = []
-        for garment, vertices in zip(reversed(self._worn), reversed(rest), strict=True):
+        for garment, vertices in zip(reversed(worn), reversed(rest), strict=True):
             hidden.append(Hidden.at_rest(vertices, garment.collision, covers, body))
             self._cover(garment, vertices, covers)
-        self.hidden = tuple(reversed(hidden))
-        """Per layer, the cloth that is pressed to the body."""
+        self._hidden = tuple(reversed(hidden))
+        self.worn = tuple(
+            replace(garment, stretch=garment.stretch.loosened(part.share > 0))
+            for garment, part in zip(worn, self._hidden, strict=True)
+        )
+        """The layers, free to crumple where they are hidden."""
 
     def frame(self, layers: Sequence[Positions], body: Obstacle) -> list[Positions]:
         """The layers of one frame, tucked in; the same arrays where nothing is.
@@ -49,7 +53,7 @@ class Tucking:
         covers: list[Obstacle] = []
         tucked = []
         for garment, hidden, vertices in zip(
-            reversed(self._worn), reversed(self.hidden), reversed(layers), strict=True
+            reversed(self.worn), reversed(self._hidden), reversed(layers), strict=True
         ):
             after = tuck(vertices, garment.collision, covers)
             tucked.append(press(after, garment.collision, hidden, body))

@@ -4,7 +4,7 @@ import numpy as np
 from igl import predicates
 from jaxtyping import Float, Int
 
-Boxes = tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
+_Boxes = tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
 """Lower and upper corners."""
 
 
@@ -39,14 +39,14 @@ def crossing_pairs(
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # several threads find them, in any order
 
 
-def _boxes(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Boxes:
+def _boxes(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> _Boxes:
     """Bounding boxes of faces."""
     first, second, third = (vertices[corner] for corner in faces.T)
     return np.minimum(np.minimum(first, second), third), np.maximum(np.maximum(first, second), third)
 
 
 def _meeting(
-    boxes: Boxes, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]
+    boxes: _Boxes, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]
 ) -> Int[np.ndarray, " n"]:
     """Rows of the boxes that meet a box."""
     both = (boxes[1] >= low) & (boxes[0] <= high)

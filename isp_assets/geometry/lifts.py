@@ -48,7 +48,7 @@ class Neighbour:
         """What the first query found, until vertices move."""
         self.watched = found.height < WATCHED
         self.other: Bool[np.ndarray, "V 6"] | None = None
-        """The same for parts that a vertex does not belong to; None until they are first looked at."""
+        """Parts of it that each vertex may touch without belonging to them; None until first looked at."""
         self.watched_other = np.ones(len(own), bool)
         self.vertices = np.flatnonzero(close)
         self.faces = np.flatnonzero(any_corner(close, topology.faces))

@@ -68,13 +68,14 @@ def leave_other_parts(
     room = np.where(np.isfinite(ways.room), ways.room, 0)[index]
     way[index] = room[:, None] * towards(position[index], skin)
     own = np.flatnonzero(pressed & way.any(axis=1))
-    share, clear = _draw(position[own], way[own], own[:, None], touched, near)
+    squeeze = _Squeeze(touched, near)
+    share, clear = squeeze.draw(position[own], way[own], own[:, None])
     known = clear | (ways.room[own] < ways.reach)
     lift[own[known]] = (share[:, None] * way[own])[known]
     size = np.maximum(np.sqrt(np.einsum("vc,vc->v", way, way)), 1e-9)
     left = np.minimum(size, ways.reach) - np.einsum("vc,vc->v", lift, way) / size
     way *= (left / size).clip(0, 1)[:, None]
-    return lift + _draw_faces(position + lift, way, caught, touched, near), pressed
+    return lift + squeeze.draw_faces(position + lift, way, caught), pressed
 
 
 def _look(
@@ -107,57 +108,53 @@ def _shallow(
     return lift * np.minimum(1, ways.room / np.maximum(size, 1e-9))[:, None], touched & ~parts
 
 
-def _draw_faces(
-    position: Float[np.ndarray, "V 3"],
-    way: Float[np.ndarray, "V 3"],
-    caught: Int[np.ndarray, "F 3"],
-    touched: Bool[np.ndarray, "V 6"],
-    near: Sequence[Neighbour],
-) -> Float[np.ndarray, "V 3"]:
-    """Moves along the corners' ways after which centres of faces and edges are clear too."""
-    points = np.einsum("qk,fkc->fqc", _SAMPLES, position[caught]).reshape(-1, 3)
-    ways = np.einsum("qk,fkc->fqc", _SAMPLES, way[caught]).reshape(-1, 3)
-    corners = np.repeat(caught, len(_SAMPLES), axis=0)
-    rows = np.flatnonzero(np.einsum("nc,nc->n", ways, ways) > _SHORTEST_WAY**2)
-    rows = rows[_clearance(points[rows], corners[rows], touched, near) < 0]
-    share, _ = _draw(points[rows], ways[rows], corners[rows], touched, near)
-    most = np.zeros(len(position))
-    used = _SAMPLES[rows % len(_SAMPLES)] > 0
-    np.maximum.at(most, corners[rows][used], np.broadcast_to(share[:, None], used.shape)[used])
-    return most[:, None] * way
+@dataclass(frozen=True, eq=False)
+class _Squeeze:
+    """Which other parts the garment touches, and all that they may be part of."""
 
+    touched: Bool[np.ndarray, "V 6"]
+    near: Sequence[Neighbour]
 
-def _draw(
-    points: Float[np.ndarray, "n 3"],
-    way: Float[np.ndarray, "n 3"],
-    corners: Int[np.ndarray, "n k"],
-    touched: Bool[np.ndarray, "V 6"],
-    near: Sequence[Neighbour],
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Share of its way that each point must go, all of it where that is not enough; and where it is."""
-    size = np.sqrt(np.einsum("nc,nc->n", way, way))
-    if len(points) == 0:
-        return size, np.zeros(0, bool)
-    moves, clear = draw_in(
-        points, way / size[:, None], size,
-        lambda places, rows: _clearance(places, corners[rows], touched, near),
-    )  # fmt: skip
-    return np.sqrt(np.einsum("nc,nc->n", moves, moves)) / size, clear
+    def draw_faces(
+        self,
+        position: Float[np.ndarray, "V 3"],
+        way: Float[np.ndarray, "V 3"],
+        caught: Int[np.ndarray, "F 3"],
+    ) -> Float[np.ndarray, "V 3"]:
+        """Moves along the corners' ways after which centres of faces and edges are clear too."""
+        points = np.einsum("qk,fkc->fqc", _SAMPLES, position[caught]).reshape(-1, 3)
+        ways = np.einsum("qk,fkc->fqc", _SAMPLES, way[caught]).reshape(-1, 3)
+        corners = np.repeat(caught, len(_SAMPLES), axis=0)
+        rows = np.flatnonzero(np.einsum("nc,nc->n", ways, ways) > _SHORTEST_WAY**2)
+        rows = rows[self.clearance(points[rows], corners[rows]) < 0]
+        share, _ = self.draw(points[rows], ways[rows], corners[rows])
+        most = np.zeros(len(position))
+        used = _SAMPLES[rows % len(_SAMPLES)] > 0
+        np.maximum.at(most, corners[rows][used], np.broadcast_to(share[:, None], used.shape)[used])
+        return most[:, None] * way
 
+    def draw(
+        self, points: Float[np.ndarray, "n 3"], way: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, "n k"]
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Share of its way that each point must go, all of it where that is not enough; and where it is."""
+        size = np.sqrt(np.einsum("nc,nc->n", way, way))
+        if len(points) == 0:
+            return size, np.zeros(0, bool)
+        moves, clear = draw_in(
+            points, way / size[:, None], size, lambda places, rows: self.clearance(places, corners[rows])
+        )
+        return np.sqrt(np.einsum("nc,nc->n", moves, moves)) / size, clear
 
-def _clearance(
-    points: Float[np.ndarray, "n 3"],
-    corners: Int[np.ndarray, "n k"],
-    touched: Bool[np.ndarray, "V 6"],
-    near: Sequence[Neighbour],
-) -> Float[np.ndarray, " n"]:
-    """How far points are above the margins over the parts that their vertices touch [m]; negative inside."""
-    least, parts = np.full(len(points), np.inf), touched[corners].any(axis=1)
-    for neighbour in near:
-        assert neighbour.other is not None
-        found = _touch(points, parts & neighbour.other[corners].any(axis=1), neighbour)
-        least = np.minimum(least, found.height - neighbour.obstacle.margin)
-    return least
+    def clearance(
+        self, points: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, " n"]:
+        """How far points are above the margins over parts that their vertices touch [m]; negative inside."""
+        least, parts = np.full(len(points), np.inf), self.touched[corners].any(axis=1)
+        for neighbour in self.near:
+            assert neighbour.other is not None
+            found = _touch(points, parts & neighbour.other[corners].any(axis=1), neighbour)
+            least = np.minimum(least, found.height - neighbour.obstacle.margin)
+        return least
 
 
 def _touch(points: Float[np.ndarray, "n 3"], parts: Bool[np.ndarray, "n 6"], neighbour: Neighbour) -> Closest:

@@ -151,11 +151,9 @@ class _Projector:
             found = obstacle.contacts(position, open_parts, within=ASIDE)
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
-        self.tight = np.zeros(len(position), bool)
+        self.tight: Bool[np.ndarray, " V"] = np.any([n.cramped for n in self.near], axis=0)
         self.pressed = np.zeros(len(position), bool)
         """Vertices between two body parts: what lifts them off one drives them into the other."""
-        for neighbour in self.near:
-            self.tight |= neighbour.cramped
 
     def lift(self) -> int:
         """Lift vertices, and triangles once most vertices are clear; the number of rounds taken."""

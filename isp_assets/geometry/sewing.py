@@ -87,7 +87,7 @@ class SewnPanels:
             fade = self.fades[side]
             distance[panel.vertex_index[fade.points]] = fade.distance
         for side, panel in self.panels.items():
-            sewn = {labels[side != "front"] for labels in (seam.labels for seam in self.seams)}
+            sewn = {seam.labels[side != "front"] for seam in self.seams}
             for label, points in panel.runs:
                 if label not in sewn:
                     distance[panel.vertex_index[points]] = np.inf

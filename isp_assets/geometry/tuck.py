@@ -109,11 +109,9 @@ class Hidden:
         for cover in covers:
             found = cover.contacts(points, mesh.parts, within=_REACH)
             near = ~found.on_border & (np.abs(found.height) < _REACH) & np.isfinite(above)
-            inside = (cover.border_rings_at(found) / _BORDER_RINGS).clip(0, 1)
-            low, high = _SURE
-            alike = ((np.einsum("vc,vc->v", normals, found.normal) - low) / (high - low)).clip(0, 1)
+            alike = np.einsum("vc,vc->v", normals, found.normal)
             crowded = (1 + np.where(near, found.height, -np.inf) / _EASY).clip(0, 1)
-            here = inside * alike * crowded
+            here = _inside(cover, found) * _sure(alike) * crowded
             lower = np.where(near, above - found.height, 0.0).clip(_OVER_BODY)
             height = np.where(here > share, lower, height)
             share = np.maximum(share, here)
@@ -154,12 +152,20 @@ def _firmness(
     It is sure inside the cover's border, where both cloths face the same way and the cover
     lies straight inwards. In the folds of an armpit none of this holds.
     """
-    inside = cover.border_rings_at(found) / _BORDER_RINGS
     alike = np.einsum("vc,vc->v", normals, found.normal)
     inwards = -np.einsum("vc,vc->v", normals, towards)
+    return _inside(cover, found) * _sure(np.minimum(alike, inwards))
+
+
+def _inside(cover: Obstacle, found: Closest) -> Float[np.ndarray, " V"]:
+    """0 on the cover's border, 1 well inside."""
+    return (cover.border_rings_at(found) / _BORDER_RINGS).clip(0, 1)
+
+
+def _sure(cosine: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
+    """0 where directions differ, 1 where they agree."""
     low, high = _SURE
-    facing = ((np.minimum(alike, inwards) - low) / (high - low)).clip(0, 1)
-    return inside.clip(0, 1) * facing
+    return ((cosine - low) / (high - low)).clip(0, 1)
 
 
 def _longer(first: Float[np.ndarray, "V 3"], second: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
