@@ -103,8 +103,13 @@ def patterns(
 def atlas(
     data: DataOption,
     category: CategoryOption,
-    patterns: Annotated[Path, typer.Option("--patterns", help="Output folder of `train patterns`.")],
     out: OutOption,
+    patterns: Annotated[
+        Path | None, typer.Option("--patterns", help="Output folder of `train patterns`.")
+    ] = None,
+    bundle: Annotated[
+        Path | None, typer.Option("--bundle", help="Instead of patterns: a bundle, to train its atlases on.")
+    ] = None,
     minutes: MinutesOption = None,
     steps: StepsOption = None,
     seed: SeedOption = 0,
@@ -113,13 +118,19 @@ def atlas(
     width: Annotated[int, typer.Option(help="Width of the atlases.")] = 128,
 ) -> None:
     """Train the maps from the panels to the rest body: CATEGORY.safetensors, a bundle (Eqs. 3-4)."""
-    from isp_assets.train.atlas import AtlasOptions, train_atlas
+    from isp_assets.bundle import GarmentBundle
+    from isp_assets.train.atlas import AtlasOptions, train_atlas, train_atlas_further
     from isp_assets.train.dataset import load_dataset
     from isp_assets.train.loop import CHECKPOINT
 
     run = _run(minutes, steps, seed, resume, device)
-    options = AtlasOptions(width=width)
-    train_atlas(load_dataset(data, category), patterns / CHECKPOINT, out, run=run, options=options)
+    if patterns is not None and bundle is None:
+        options = AtlasOptions(width=width)
+        train_atlas(load_dataset(data, category), patterns / CHECKPOINT, out, run=run, options=options)
+    elif bundle is not None and patterns is None:
+        train_atlas_further(load_dataset(data, category), GarmentBundle.load(bundle), out, run=run)
+    else:
+        raise typer.BadParameter("give either --patterns or --bundle")
 
 
 @train_app.command("skin")

@@ -1,5 +1,7 @@
 """Pattern and atlas training on three sewn tubes, from data to a bundle that decodes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,14 @@ from training_sets import tube_dataset
 from isp_assets.bundle import GarmentBundle
 from isp_assets.errors import DatasetError, TrainError
 from isp_assets.train.assemble import assemble_bundle
-from isp_assets.train.atlas import AtlasOptions, AtlasTask, train_atlas
+from isp_assets.train.atlas import (
+    AtlasOptions,
+    AtlasTask,
+    FurtherAtlasTask,
+    train_atlas,
+    train_atlas_further,
+    weigh_slip,
+)
 from isp_assets.train.atlas_metrics import measure_atlases
 from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places, seam_indices
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint
@@ -67,6 +76,41 @@ def test_parts_of_different_runs_are_refused(trained, tmp_path):
         assemble_bundle(dataset, tmp_path / CHECKPOINT, folder / "atlas" / CHECKPOINT)
     with pytest.raises(TrainError, match="another dataset"):
         AtlasTask(tube_dataset((0.3, 0.4)), tmp_path / CHECKPOINT, ATLAS, RunOptions(steps=1))
+
+
+def test_atlases_trained_further_are_better_and_nothing_else_changes(trained, tmp_path):
+    dataset, folder = trained
+    old = GarmentBundle.load(folder / "atlas" / "tube.safetensors")
+    options = replace(ATLAS, rate=1e-3)
+    train_atlas_further(
+        dataset, old, tmp_path, run=RunOptions(steps=200, hold=0.1, measurements=1), options=options
+    )
+    new = GarmentBundle.load(tmp_path / "tube.safetensors")
+    assert new.metrics["atlas"]["vertex_mm"] < 0.9 * old.metrics["atlas"]["vertex_mm"]
+    assert new.metrics["patterns"] == pytest.approx(old.metrics["patterns"], rel=1e-4)
+    assert all(np.array_equal(new.codes[name], code) for name, code in old.codes.items())
+    for side, field in old.model.panel_fields.items():
+        kept = new.model.panel_fields[side].state_dict()
+        assert all(torch.equal(kept[name], value) for name, value in field.state_dict().items())
+    assert new.provenance["atlas"]["step"] == 200
+    assert new.provenance["atlas"]["earlier"] == old.provenance["atlas"]
+    assert new.provenance["patterns"] == old.provenance["patterns"]
+
+
+def test_atlases_are_trained_further_on_their_own_garments_only(trained):
+    bundle = GarmentBundle.load(trained[1] / "atlas" / "tube.safetensors")
+    with pytest.raises(TrainError, match="other garments of the same names"):
+        FurtherAtlasTask(tube_dataset((0.3, 0.4, 0.9)), bundle, ATLAS, RunOptions(steps=1))
+    with pytest.raises(TrainError, match=r"no codes for 1 of the dataset's 4 .*tube_3"):
+        FurtherAtlasTask(tube_dataset((0.3, 0.4, 0.5, 0.6)), bundle, ATLAS, RunOptions(steps=1))
+
+
+def test_slip_is_what_lies_along_the_triangle():
+    normal = torch.tensor([0.0, 0.0, 3.0])
+    error = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 2.0], [3.0, 4.0, -5.0]])
+    expected = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 2.0], [1.5, 2.0, -5.0]])
+    assert torch.allclose(weigh_slip(error, normal, 0.5), expected)
+    assert torch.allclose(weigh_slip(error, normal, 1.0), error)
 
 
 def test_resuming_pattern_training_is_exact(tmp_path):

@@ -71,6 +71,33 @@ def assemble_bundle(
     )  # fmt: skip
 
 
+def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path) -> GarmentBundle:
+    """The bundle with its atlases replaced by those of a checkpoint, at 16 bits, and measured anew.
+
+    Args:
+        dataset: The dataset that both were trained on.
+        bundle: Codes, panel fields and whatever else stays.
+        atlases: Checkpoint of atlases trained for the bundle's codes.
+
+    Raises:
+        BundleError: If the checkpoint cannot be read.
+    """
+    weights, manifest = read_checkpoint(atlases)
+    maps = {
+        side: _load(Atlas(AtlasConfig.from_dict(manifest["config"]["atlas"][side])), weights, f"{side}.")
+        for side in PANELS
+    }
+    model = replace(bundle.model, atlases=maps)
+    stored = _rounded(model)
+    codes = np.stack([bundle.code(garment.name) for garment in dataset.garments])
+    notes = _run_notes(manifest) | {"earlier": bundle.provenance.get("atlas", {})}
+    metrics = {**bundle.metrics, **measure_model(stored, codes, dataset)}
+    return replace(
+        bundle, model=stored, provenance={**bundle.provenance, "atlas": notes},
+        metrics=metrics | {"float32": measure_model(model, codes, dataset)},
+    )  # fmt: skip
+
+
 def measure_model(model: GarmentModel, codes: np.ndarray, dataset: GarmentDataset) -> dict[str, Any]:
     """Errors of the pattern networks over every garment of a dataset."""
     every, table = range(len(dataset.garments)), torch.from_numpy(codes)
@@ -125,13 +152,17 @@ def _spread(codes: np.ndarray) -> dict[str, Any]:
 
 
 def _provenance(patterns: Mapping[str, Any], atlas: Mapping[str, Any]) -> dict[str, Any]:
-    keys = ("seed", "step", "seconds", "device", "threads")
     return {
         "dataset_sha256": patterns["config"]["dataset_sha256"],
-        "patterns": {key: patterns.get(key) for key in keys} | {"options": patterns["config"]["options"]},
-        "atlas": {key: atlas.get(key) for key in keys} | {"options": atlas["config"]["options"]},
+        "patterns": _run_notes(patterns),
+        "atlas": _run_notes(atlas),
         "versions": {
             "isp_assets": isp_assets.__version__, "torch": torch.__version__, "numpy": np.__version__,
             "python": platform.python_version(),
         },
     }  # fmt: skip
+
+
+def _run_notes(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    keys = ("seed", "step", "seconds", "device", "threads")
+    return {key: manifest.get(key) for key in keys} | {"options": manifest["config"]["options"]}
