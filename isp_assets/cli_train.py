@@ -115,7 +115,7 @@ def atlas(
     seed: SeedOption = 0,
     resume: ResumeOption = False,
     device: DeviceOption = "cpu",
-    width: Annotated[int, typer.Option(help="Width of the atlases.")] = 128,
+    width: Annotated[int | None, typer.Option(help="Width of new atlases. [default: 128]")] = None,
 ) -> None:
     """Train the maps from the panels to the rest body: CATEGORY.safetensors, a bundle (Eqs. 3-4)."""
     from isp_assets.bundle import GarmentBundle
@@ -124,8 +124,10 @@ def atlas(
     from isp_assets.train.loop import CHECKPOINT
 
     run = _run(minutes, steps, seed, resume, device)
+    if bundle is not None and width is not None:
+        raise typer.BadParameter("the atlases of a bundle keep their width; leave --width out")
     if patterns is not None and bundle is None:
-        options = AtlasOptions(width=width)
+        options = AtlasOptions() if width is None else AtlasOptions(width=width)
         train_atlas(load_dataset(data, category), patterns / CHECKPOINT, out, run=run, options=options)
     elif bundle is not None and patterns is None:
         train_atlas_further(load_dataset(data, category), GarmentBundle.load(bundle), out, run=run)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 JOB = 'name = "j"\nmotion = "walk"\nframes = "1-2"\nresolution = 40\noutfit = ["tank_top"]\n'
+ATLAS = ("train", "atlas", "--data", "x", "--category", "top", "--steps", "1")
 
 
 def command(*arguments: object) -> list[str]:
@@ -106,6 +107,9 @@ def test_garments_lists_the_collection() -> None:
         (("fit", "mesh", "{job}", "-o", "c.safetensors"), 3, "meshes are read from"),
         (("evaluate", "decode", "--bundle", "none", "--out", "o"), 3, "no such file"),
         (("train", "patterns", "--data", "x", "--category", "top", "--out", "o"), 5, "steps or of minutes"),
+        ((*ATLAS, "--out", "o"), 2, "either --patterns or --bundle"),
+        ((*ATLAS, "--out", "o", "--patterns", "p", "--bundle", "b"), 2, "either --patterns or --bundle"),
+        ((*ATLAS, "--out", "o", "--bundle", "b", "--width", "64"), 2, "leave --width out"),
     ],
 )
 def test_errors_are_one_message_and_a_code(

@@ -93,6 +93,7 @@ def test_atlases_trained_further_are_better_and_nothing_else_changes(trained, tm
         kept = new.model.panel_fields[side].state_dict()
         assert all(torch.equal(kept[name], value) for name, value in field.state_dict().items())
     assert new.provenance["atlas"]["step"] == 200
+    assert new.provenance["atlas"]["dataset_sha256"] == dataset_digest(dataset)
     assert new.provenance["atlas"]["earlier"] == old.provenance["atlas"]
     assert new.provenance["patterns"] == old.provenance["patterns"]
 
@@ -101,6 +102,8 @@ def test_atlases_are_trained_further_on_their_own_garments_only(trained):
     bundle = GarmentBundle.load(trained[1] / "atlas" / "tube.safetensors")
     with pytest.raises(TrainError, match="other garments of the same names"):
         FurtherAtlasTask(tube_dataset((0.3, 0.4, 0.9)), bundle, ATLAS, RunOptions(steps=1))
+    with pytest.raises(TrainError, match="holds 'tube', the dataset 'hose'"):
+        FurtherAtlasTask(replace(tube_dataset(), category="hose"), bundle, ATLAS, RunOptions(steps=1))
     with pytest.raises(TrainError, match=r"no codes for 1 of the dataset's 4 .*tube_3"):
         FurtherAtlasTask(tube_dataset((0.3, 0.4, 0.5, 0.6)), bundle, ATLAS, RunOptions(steps=1))
 

@@ -46,14 +46,10 @@ def assemble_bundle(
         TrainError: If the two checkpoints do not belong together.
     """
     pattern_weights, pattern_manifest = read_checkpoint(patterns)
-    atlas_weights, atlas_manifest = read_checkpoint(atlases)
+    maps, atlas_manifest = _read_atlases(atlases)
     _check_pair(patterns, pattern_manifest, atlases, atlas_manifest)
     field_config = PanelFieldConfig.from_dict(pattern_manifest["config"]["field"])
-    fields, maps = dict[str, PanelField](), dict[str, Atlas]()
-    for side in PANELS:
-        config = AtlasConfig.from_dict(atlas_manifest["config"]["atlas"][side])
-        fields[side] = _load(PanelField(field_config), pattern_weights, f"fields.{side}.")
-        maps[side] = _load(Atlas(config), atlas_weights, f"{side}.")
+    fields = {side: _load(PanelField(field_config), pattern_weights, f"fields.{side}.") for side in PANELS}
     model = GarmentModel(
         category=dataset.category, panel_fields=fields, atlases=maps, edge_names=dict(dataset.edge_names),
         seam_pairs=tuple(dataset.seam_pairs), anchor_labels=tuple(dataset.anchor_labels),
@@ -75,22 +71,21 @@ def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path)
     """The bundle with its atlases replaced by those of a checkpoint, at 16 bits, and measured anew.
 
     Args:
-        dataset: The dataset that both were trained on.
+        dataset: The dataset that the atlases were trained on.
         bundle: Codes, panel fields and whatever else stays.
         atlases: Checkpoint of atlases trained for the bundle's codes.
 
     Raises:
         BundleError: If the checkpoint cannot be read.
     """
-    weights, manifest = read_checkpoint(atlases)
-    maps = {
-        side: _load(Atlas(AtlasConfig.from_dict(manifest["config"]["atlas"][side])), weights, f"{side}.")
-        for side in PANELS
-    }
+    maps, manifest = _read_atlases(atlases)
     model = replace(bundle.model, atlases=maps)
     stored = _rounded(model)
     codes = np.stack([bundle.code(garment.name) for garment in dataset.garments])
-    notes = _run_notes(manifest) | {"earlier": bundle.provenance.get("atlas", {})}
+    notes = _run_notes(manifest) | {
+        "dataset_sha256": manifest["config"]["dataset_sha256"],
+        "earlier": bundle.provenance.get("atlas", {}),
+    }
     metrics = {**bundle.metrics, **measure_model(stored, codes, dataset)}
     return replace(
         bundle, model=stored, provenance={**bundle.provenance, "atlas": notes},
@@ -117,6 +112,13 @@ def _check_pair(patterns: Path, first: Mapping[str, Any], atlases: Path, second:
                 f"{atlases} was trained on another {key} ({two}) than {patterns} has ({one}); "
                 "train the atlas again"
             )
+
+
+def _read_atlases(path: Path) -> tuple[dict[str, Atlas], dict[str, Any]]:
+    """The atlases of a checkpoint by panel, and its manifest."""
+    weights, manifest = read_checkpoint(path)
+    configs = {side: AtlasConfig.from_dict(manifest["config"]["atlas"][side]) for side in PANELS}
+    return {side: _load(Atlas(configs[side]), weights, f"{side}.") for side in PANELS}, manifest
 
 
 def _load(network: Any, weights: Mapping[str, torch.Tensor], prefix: str) -> Any:

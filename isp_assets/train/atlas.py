@@ -97,14 +97,14 @@ def train_atlas_further(
     Codes and panel fields stay, and with them the displacements.
 
     Args:
-        dataset: The dataset that the bundle was trained on.
+        dataset: The dataset that the bundle was trained on, or a part of it.
         bundle: Where to start.
         folder: Where the new bundle, the checkpoint and the history go.
         run: How long and where to train.
         options: Losses; the networks keep their size.
 
     Raises:
-        TrainError: If ``bundle`` was trained on another dataset, or training diverges or cannot resume.
+        TrainError: If ``bundle`` was trained on other garments, or training diverges or cannot resume.
     """
     task = FurtherAtlasTask(dataset, bundle, options or AtlasOptions(rate=FURTHER_RATE), run)
     report = train(task, folder, run)
@@ -196,8 +196,10 @@ class FurtherAtlasTask(_AtlasTask):
     def __init__(
         self, dataset: GarmentDataset, bundle: GarmentBundle, options: AtlasOptions, run: RunOptions
     ) -> None:
+        if bundle.category != dataset.category:
+            raise TrainError(f"the bundle holds {bundle.category!r}, the dataset {dataset.category!r}")
         missing = [garment.name for garment in dataset.garments if garment.name not in bundle.codes]
-        if missing or bundle.category != dataset.category:
+        if missing:
             raise TrainError(
                 f"the bundle {bundle.category!r} has no codes for {len(missing)} of the dataset's "
                 f"{len(dataset.garments)} {dataset.category!r} garments, {missing[:3]}...; give the dataset "
