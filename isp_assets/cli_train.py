@@ -116,10 +116,14 @@ def atlas(
     resume: ResumeOption = False,
     device: DeviceOption = "cpu",
     width: Annotated[int | None, typer.Option(help="Width of new atlases. [default: 128]")] = None,
+    batch: Annotated[int, typer.Option(help="Garments a step; a GPU takes 96 in nearly the same time.")] = 24,
+    rate: Annotated[
+        float | None, typer.Option(help="Peak learning rate. [default: .0015; with --bundle .0006]")
+    ] = None,
 ) -> None:
     """Train the maps from the panels to the rest body: CATEGORY.safetensors, a bundle (Eqs. 3-4)."""
     from isp_assets.bundle import GarmentBundle
-    from isp_assets.train.atlas import AtlasOptions, train_atlas, train_atlas_further
+    from isp_assets.train.atlas import FURTHER_RATE, AtlasOptions, train_atlas, train_atlas_further
     from isp_assets.train.dataset import load_dataset
     from isp_assets.train.loop import CHECKPOINT
 
@@ -127,10 +131,15 @@ def atlas(
     if bundle is not None and width is not None:
         raise typer.BadParameter("the atlases of a bundle keep their width; leave --width out")
     if patterns is not None and bundle is None:
-        options = AtlasOptions() if width is None else AtlasOptions(width=width)
+        defaults = AtlasOptions()
+        options = AtlasOptions(
+            width=width or defaults.width, garments_per_step=batch, rate=rate or defaults.rate
+        )
         train_atlas(load_dataset(data, category), patterns / CHECKPOINT, out, run=run, options=options)
     elif bundle is not None and patterns is None:
-        train_atlas_further(load_dataset(data, category), GarmentBundle.load(bundle), out, run=run)
+        options = AtlasOptions(garments_per_step=batch, rate=rate or FURTHER_RATE)
+        further = GarmentBundle.load(bundle)
+        train_atlas_further(load_dataset(data, category), further, out, run=run, options=options)
     else:
         raise typer.BadParameter("give either --patterns or --bundle")
 

@@ -23,6 +23,7 @@ from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.geometry.stretch import StretchLimit
 from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField
+from isp_assets.networks.placement import on_device
 from isp_assets.outfit import Outfit, OutfitItem
 from isp_assets.skinning import BoundGarment, bind, shape_garment
 
@@ -72,15 +73,15 @@ def _wear(
 ) -> WornGarment:
     item = outfit.items[index]
     garment = decode_garment(item.bundle.model, item.code, resolution=resolution, name=item.name)
-    skin = bind(garment, body, outfit.skin.skin_field.to(device))
+    skin = bind(garment, body, on_device(outfit.skin.skin_field, device))
     flat = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, Fabric())
     graded = graded_rest(flat.to(device, torch.float32), skin.canonical, shape_garment(skin, betas))
     ramp = anchor_ramp(garment)
     field, displacement = item.bundle.drape_field, None
     if field is not None:
-        field = field.to(device).eval()
+        field = on_device(field, device).eval()
         sampler = panel_sampler(garment, item.bundle.model, resolution=field.config.map_size)
-        displacement = bind_displacement(field, sampler, ramp)
+        displacement = bind_displacement(field, sampler.to(device), ramp)
     return WornGarment(
         layer=_layer(outfit.layer_name(index), garment, item),
         code=torch.as_tensor(item.code, device=device),
@@ -98,7 +99,7 @@ def _wear(
 def _layering(outfit: Outfit, garment: Garment, item: OutfitItem, device: str) -> BoundLayering | None:
     if outfit.layering is None:
         return None
-    network = outfit.layering.layering_net.to(device).eval()
+    network = on_device(outfit.layering.layering_net, device).eval()
     sampler = panel_sampler(garment, item.bundle.model, resolution=network.config.map_size)
     return bind_layering(network, garment, sampler, device=device)
 

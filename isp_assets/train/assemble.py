@@ -68,7 +68,7 @@ def assemble_bundle(
 
 
 def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path) -> GarmentBundle:
-    """The bundle with its atlases replaced by those of a checkpoint, at 16 bits, and measured anew.
+    """The bundle with its atlases replaced by those of a checkpoint, at 16 bits, and these measured anew.
 
     Args:
         dataset: The dataset that the atlases were trained on.
@@ -86,10 +86,13 @@ def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path)
         "dataset_sha256": manifest["config"]["dataset_sha256"],
         "earlier": bundle.provenance.get("atlas", {}),
     }
-    metrics = {**bundle.metrics, **measure_model(stored, codes, dataset)}
+    table, every = torch.from_numpy(codes), range(len(dataset.garments))
+    unrounded, rounded = (
+        {"atlas": measure_atlases(one.atlases, table, dataset, garments=every)} for one in (model, stored)
+    )
     return replace(
         bundle, model=stored, provenance={**bundle.provenance, "atlas": notes},
-        metrics=metrics | {"float32": measure_model(model, codes, dataset)},
+        metrics={**bundle.metrics, **rounded, "float32": {**bundle.metrics.get("float32", {}), **unrounded}},
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
+from isp_assets.networks.placement import on_device
 from isp_assets.skinning import shape_garment, skin_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
@@ -87,7 +88,8 @@ class DisplacementTask:
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)
-        samples = build_wardrobe(bundle, body, skin.skin_field, wardrobe, seed=seed)
+        skin_field = on_device(skin.skin_field, self.device)
+        samples = build_wardrobe(bundle, self.body, skin_field, wardrobe, seed=seed)
         self.wardrobe = [sample.to(self.device) for sample in samples]
         self.clips = load_clips(options.poses)
         self.module = DrapeField(config)

@@ -241,13 +241,14 @@ def train_layering(
     options = options or LayeringOptions()
     task = LayeringTask(bundles, skin, body, options, device=run.device, seed=run.seed)
     report = train(task, out, run)
+    metrics = task.measure_on(stacks=stacks)
     result = LayeringBundle(
         task.module.cpu().eval().requires_grad_(False),
         provenance={
             "steps": report.steps, "seconds": report.seconds, "device": report.device, "seed": run.seed,
             "config": dict(task.config),
         },
-        metrics=task.measure_on(stacks=stacks),
+        metrics=metrics,
     )  # fmt: skip
     result.save(Path(out) / "layering.safetensors")
     return result

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from isp_assets.body import Body
@@ -57,25 +57,33 @@ class Samples:
     def take(self, index: Tensor | slice) -> "Samples":
         return Samples(self.points[index], self.width[index])
 
+    def to(self, device: torch.device) -> "Samples":
+        return Samples(self.points.to(device), self.width.to(device))
+
 
 class SkinTask:
     """What `train` needs: the field, its target, losses and metrics."""
 
     name = "skin"
 
-    def __init__(self, body: Body, config: SkinFieldConfig, diffusion: Diffusion, *, seed: int = 0) -> None:
-        self.body, self.diffusion = body, diffusion
+    def __init__(
+        self, body: Body, config: SkinFieldConfig, diffusion: Diffusion, *,
+        seed: int = 0, device: str = "cpu",
+    ) -> None:  # fmt: skip
+        self.diffusion, self.device = diffusion, torch.device(device)
         self.config: Mapping[str, Any] = {
             "field": config.to_dict(), "diffusion": asdict(diffusion), "body": body.sha256,
         }  # fmt: skip
         poses = torch.tensor(config.rest_poses).unflatten(1, (24, 3))
-        self.surfaces = body.pose(poses).vertices
-        self.area = _vertex_area(body)
-        self.corrective = body.pose_dirs @ body.pose(torch.tensor(_BENT)[None]).pose_feature[0]
+        surfaces, area, faces = body.pose(poses).vertices, _vertex_area(body), body.faces.numpy()
+        corrective = body.pose_dirs @ body.pose(torch.tensor(_BENT)[None]).pose_feature[0]
         self.module = SkinField(config)
-        self.module.place_on(self.surfaces, self.area)
+        self.module.place_on(surfaces, area)
         rng = np.random.default_rng(seed)
-        drawn = [self._draw(surface, rng) for surface in self.surfaces]
+        drawn = [self._draw(surface, faces, rng).to(self.device) for surface in surfaces]
+        self.body, self.module = body.to(self.device), self.module.to(self.device)
+        self.surfaces, self.area = surfaces.to(self.device), area.to(self.device)
+        self.corrective = corrective.to(self.device)
         self.pools = [samples.take(slice(_HELD_OUT, None)) for samples in drawn]
         self.held_out = [samples.take(slice(_HELD_OUT)) for samples in drawn]
 
@@ -86,14 +94,14 @@ class SkinTask:
         """Squared log ratio of the kernel widths; with a head, also the cross-entropy of the weights."""
         config = self.module.config
         terms: dict[str, Tensor] = {}
-        width_loss, entropy = torch.zeros(()), torch.zeros(())
+        width_loss, entropy = torch.zeros((), device=self.device), torch.zeros((), device=self.device)
         for rest, pool in enumerate(self.pools):
             if config.kernel:
-                batch = pool.take(torch.randint(len(pool.points), (4096,), generator=generator))
+                batch = pool.take(self._rows(len(pool.points), 4096, generator))
                 ratio = self.module.log_width(batch.points, rest=rest) - batch.width.log()
                 width_loss = width_loss + ratio.square().mean()
             if config.rank:
-                batch = pool.take(torch.randint(len(pool.points), (256,), generator=generator))
+                batch = pool.take(self._rows(len(pool.points), 256, generator))
                 log_weights = self.module.logits(batch.points, rest=rest).log_softmax(-1)
                 entropy = entropy - (self.target(batch, rest=rest) * log_weights).sum(-1).mean()
         if config.kernel:
@@ -101,6 +109,9 @@ class SkinTask:
         if config.rank:
             terms["entropy"] = 0.01 * entropy
         return terms
+
+    def _rows(self, available: int, count: int, generator: torch.Generator) -> Tensor:
+        return torch.randint(available, (count,), generator=generator).to(self.device)
 
     def target(self, samples: Samples, *, rest: int) -> Float[Tensor, "P N"]:
         """The weights that the field should give."""
@@ -119,7 +130,8 @@ class SkinTask:
         count = self.body.shape_dirs.shape[-1]
         shape = ((weights - target) @ self.body.shape_dirs.flatten(1)).unflatten(1, (3, count)).norm(dim=1)
         pose = ((weights - target) @ self.corrective).norm(dim=-1)
-        beside = samples.points + _STEP * torch.nn.functional.normalize(torch.ones(3), dim=0)
+        diagonal = torch.nn.functional.normalize(torch.ones(3, device=self.device), dim=0)
+        beside = samples.points + _STEP * diagonal
         change = 0.5 * ((self.module(beside, rest=rest) - weights) @ self.body.weights).abs().sum(-1)
         return {
             "joint_weight_error_mean": float(joint.mean()),
@@ -129,10 +141,12 @@ class SkinTask:
             "joint_weight_change_per_cm_p99": float(change.quantile(0.99)) * 0.01 / _STEP,
         }
 
-    def _draw(self, surface: Float[Tensor, "N 3"], rng: np.random.Generator) -> Samples:
+    def _draw(
+        self, surface: Float[Tensor, "N 3"], faces: Int[np.ndarray, "F 3"], rng: np.random.Generator
+    ) -> Samples:
         """A fifth of the points on the skin, the rest at log-uniform offsets roughly along the normal."""
         count = self.diffusion.samples + _HELD_OUT
-        vertices, faces = surface.double().numpy(), self.body.faces.numpy()
+        vertices = surface.double().numpy()
         corner = vertices[faces]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         doubled = np.linalg.norm(normal, axis=1)
@@ -171,12 +185,13 @@ def train_skin(
     poses = tuple(tuple(float(x) for x in np.asarray(pose).reshape(-1)) for pose in rest_poses)
     config = config or SkinFieldConfig(num_vertices=len(body.template))
     task = SkinTask(
-        body, replace(config, num_vertices=len(body.template), rest_poses=poses), diffusion or Diffusion()
-    )
+        body, replace(config, num_vertices=len(body.template), rest_poses=poses), diffusion or Diffusion(),
+        device=options.device,
+    )  # fmt: skip
     report = train(task, out, options)
     provenance = {"steps": report.steps, "seconds": round(report.seconds, 1), "config": dict(task.config)}
     bundle = SkinBundle(
-        task.module, body_sha256=body.sha256, provenance=provenance, metrics=dict(report.metrics)
+        task.module.cpu(), body_sha256=body.sha256, provenance=provenance, metrics=dict(report.metrics)
     )
     bundle.save(Path(out) / "skin.safetensors")
     return report

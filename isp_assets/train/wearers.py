@@ -21,6 +21,7 @@ from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField
 from isp_assets.networks.layering_net import LayeringNet
+from isp_assets.networks.placement import on_device
 from isp_assets.skinning import BoundGarment, skin_garment
 from isp_assets.train.wardrobe import WardrobeOptions, build_wardrobe
 
@@ -64,11 +65,11 @@ def build_wearers(
     Raises:
         TrainError: If too few garments can be made.
     """
-    wearers = []
-    for sample in build_wardrobe(bundle, body, skin.skin_field, options, seed=seed):
+    wearers, skin_field = [], on_device(skin.skin_field, device)
+    for sample in build_wardrobe(bundle, body.to(device), skin_field, options, seed=seed):
         field, displacement = bundle.drape_field, None
         if field is not None:
-            field = field.to(device).eval()
+            field = on_device(field, device).eval()
             sampler = panel_sampler(sample.garment, bundle.model, resolution=field.config.map_size)
             displacement = bind_displacement(field, sampler.to(device), sample.ramp[:, 0].cpu().numpy())
         wearers.append(
