@@ -37,6 +37,8 @@ app.add_typer(evaluate_app, name="evaluate")
 out_console = Console()
 error_console = Console(stderr=True, soft_wrap=True)
 
+_MOST_WORKERS = 8  # unless asked for more
+
 
 class Device(str, Enum):
     """Where networks run."""
@@ -60,6 +62,14 @@ StepsOption = Annotated[
 ]
 
 
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Processes, 1 GB of memory each. [default: one a core, up to 8; 1 with smoothing]"
+    ),
+]
+
+
 @app.command()
 def demo(
     out: OutOption,
@@ -67,9 +77,10 @@ def demo(
     write: WriteOption = None,
     device: DeviceOption = Device.auto,
     steps: StepsOption = None,
+    workers: WorkersOption = None,
 ) -> None:
     """Drape the built-in outfit over the built-in walk and write every format."""
-    drape(Path(__file__).parent / "data" / "demo.toml", out, frames, write, device, steps)
+    drape(Path(__file__).parent / "data" / "demo.toml", out, frames, write, device, steps, workers=workers)
 
 
 @app.command()
@@ -83,12 +94,14 @@ def drape(
     smoothing: Annotated[
         float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
     ] = 0.0,
+    workers: WorkersOption = None,
 ) -> None:
     """Drape a shot file and write NAME.usdc, .glb, .rrd, .png and report.json."""
     from dataclasses import replace
 
     from isp_assets.drape import DrapeOptions
     from isp_assets.pipeline import run_job, split_names
+    from isp_assets.processes import available_cores
     from isp_assets.shot import ShotJob
 
     with out_console.status("loading"):
@@ -103,6 +116,7 @@ def drape(
             job,
             out,
             options=options,
+            workers=workers or (1 if smoothing else min(available_cores(), _MOST_WORKERS)),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     _print_report(report, job, out)

@@ -48,7 +48,7 @@ class DrapeOptions:
     """Rungs to run; ``skin`` is always needed."""
     resolution: int = DEFAULT_RESOLUTION
     """Grid cells across a panel, 32 to 512."""
-    chunk: int = 16
+    chunk: int = 8
     """Frames held at once."""
     device: str = "cpu"
     body_margin: float = BODY_MARGIN
@@ -89,19 +89,35 @@ def drape(outfit: Outfit, shot: Shot, options: DrapeOptions | None = None) -> Dr
         DecodeError: If a code gives no valid garment.
     """
     options = options or DrapeOptions()
-    if shot.body.sha256 != outfit.body_sha256:
-        raise DrapeError(
-            f"shot {shot.name!r}: body {shot.body.name!r} ({shot.body.sha256[:12]}) is not the body that "
-            f"the outfit was trained on ({outfit.body_sha256[:12]})"
-        )
-    draper = _Draper(outfit, shot, options)
-    return DrapedFrames(draper.scene, draper.chunks())
+    draper = Draper(outfit, shot, options)
+    return DrapedFrames(draper.scene, (draper.chunk(rows) for rows in chunk_rows(shot, options)))
 
 
-class _Draper:
-    """The state of one shot: static data, and one chunk at a time."""
+def chunk_rows(shot: Shot, options: DrapeOptions) -> list[slice]:
+    """The rows of a shot's motion that are draped together, in order."""
+    starts = range(0, len(shot.motion), options.chunk)
+    return [slice(start, start + options.chunk) for start in starts]
+
+
+class Draper:
+    """An outfit decoded and bound for a shot; drapes any chunk of its frames.
+
+    Args:
+        outfit: Garments, innermost first.
+        shot: The body in motion.
+        options: Rungs, device, chunk size.
+
+    Raises:
+        DrapeError: If the shot's body is not the outfit's.
+        DecodeError: If a code gives no valid garment.
+    """
 
     def __init__(self, outfit: Outfit, shot: Shot, options: DrapeOptions) -> None:
+        if shot.body.sha256 != outfit.body_sha256:
+            raise DrapeError(
+                f"shot {shot.name!r}: body {shot.body.name!r} ({shot.body.sha256[:12]}) is not the body that "
+                f"the outfit was trained on ({outfit.body_sha256[:12]})"
+            )
         self.shot, self.options = shot, options
         self.body = shot.body.to(options.device)
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
@@ -127,12 +143,13 @@ class _Draper:
         skin = Obstacle(self.body_collision, posed.vertices[0].cpu().numpy(), margin=self.options.body_margin)
         return Tucking(worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
 
-    def chunks(self) -> Iterator[FrameChunk]:
-        for start in range(0, len(self.shot.motion), self.options.chunk):
-            yield self._chunk(slice(start, start + self.options.chunk))
-
     @torch.no_grad()
-    def _chunk(self, rows: slice) -> FrameChunk:
+    def chunk(self, rows: slice) -> FrameChunk:
+        """Drape some frames; with smoothing, they must follow those of the call before.
+
+        Raises:
+            DrapeError: If a result is not finite.
+        """
         motion, device = self.shot.motion, self.options.device
         state = _ChunkState()
         with state.timed("body"):

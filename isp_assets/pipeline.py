@@ -9,17 +9,18 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from isp_assets.drape import DrapeOptions, drape
+from isp_assets.drape import DrapeOptions
+from isp_assets.drape_workers import Complete, drape_shot
 from isp_assets.errors import IspAssetsError, PluginError
 from isp_assets.evaluate.frames import FrameMeter, summarise
 from isp_assets.evaluate.job_warnings import job_warnings
 from isp_assets.evaluate.table import machine
 from isp_assets.files import write_text
-from isp_assets.frames import DrapedFrames, FrameChunk
+from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.plugin import ShotWriter, make_writer
 from isp_assets.shot import ShotJob
 
@@ -35,6 +36,7 @@ def run_job(
     out: Path,
     *,
     options: DrapeOptions,
+    workers: int = 1,
     measure_stages_every: int = 8,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -44,6 +46,7 @@ def run_job(
         job: What to drape and which writers to run.
         out: Output folder; made if missing. Existing outputs are replaced whole.
         options: Device, steps and chunk size.
+        workers: Processes that drape and measure; see `drape_shot`.
         measure_stages_every: Measure the earlier rungs of the ladder on every n-th frame; 0 never.
 
     Returns:
@@ -55,18 +58,21 @@ def run_job(
     started = time.perf_counter()
     writers = {name: make_writer(name) for name in job.write}
     clock: dict[str, float] = {}
-    draped = drape(
+    draped = drape_shot(
         job.outfit,
         job.shot,
         replace(options, resolution=job.resolution, keep_stages=measure_stages_every > 0),
+        workers=workers,
+        finish=Measuring(measure_stages_every),
     )
     clock["prepare"] = time.perf_counter() - started
     paths = {name: out / f"{job.shot.name}{writer.suffix}" for name, writer in writers.items()}
     _check_paths(paths)
     out.mkdir(parents=True, exist_ok=True)
-    rows = _write_all(draped, writers, paths, measure_stages_every, clock, progress)
+    rows = _write_all(draped, writers, paths, clock, progress)
     clock["total"] = time.perf_counter() - started
-    text = json.dumps(_report(job, draped, options, rows, clock, paths), indent=1, allow_nan=False)
+    report = _report(job, draped, {**asdict(options), "workers": workers}, rows, clock, paths)
+    text = json.dumps(report, indent=1, allow_nan=False)
     write_text(out / "report.json", text + "\n")
     return json.loads(text)
 
@@ -81,26 +87,23 @@ def _write_all(
     draped: DrapedFrames,
     writers: dict[str, ShotWriter],
     paths: dict[str, Path],
-    stages_every: int,
     clock: dict[str, float],
     progress: Progress | None,
 ) -> list[dict[str, Any]]:
-    meter = FrameMeter(draped.scene)
     rows: list[dict[str, Any]] = []
     total = len(draped.scene.frames)
     try:
         for name, writer in writers.items():
             _timed(clock, f"write {name}", name, writer.begin, paths[name], draped.scene)
-        for raw in draped:
-            for stage, seconds in raw.times.seconds.items():
+        for chunk in draped:
+            for stage, seconds in chunk.times.seconds.items():
                 clock[stage] = clock.get(stage, 0.0) + seconds
-            chunk = _measured(raw, meter, stages_every, clock, len(rows))
             rows.extend(
                 {"frame": int(f), "steps": [list(s) for s in chunk.steps[i]], **chunk.metrics[i]}
                 for i, f in enumerate(chunk.frames)
             )
             for name, writer in writers.items():
-                _timed(clock, f"write {name}", name, writer.add, replace(chunk, stages={}))
+                _timed(clock, f"write {name}", name, writer.add, chunk)
             if progress is not None:
                 progress(len(rows), total)
         for name, writer in writers.items():
@@ -112,16 +115,27 @@ def _write_all(
     return rows
 
 
-def _measured(
-    chunk: FrameChunk, meter: FrameMeter, stages_every: int, clock: dict[str, float], done: int
-) -> FrameChunk:
-    start = time.perf_counter()
-    metrics = []
-    for i in range(len(chunk.frames)):
-        with_stages = stages_every > 0 and (done + i) % stages_every == 0
-        metrics.append(meter.measure(chunk, i, stages=with_stages))
-    clock["measure"] = clock.get("measure", 0.0) + time.perf_counter() - start
-    return replace(chunk, metrics=tuple(metrics))
+@dataclass(frozen=True)
+class Measuring:
+    """Measures every chunk, in the process that draped it."""
+
+    stages_every: int
+    """Also measure the earlier rungs on every n-th frame; 0 never."""
+
+    def __call__(self, scene: Scene) -> Complete:
+        """What measures chunks of this scene; it drops the earlier rungs afterwards."""
+        meter = FrameMeter(scene)
+
+        def measured(chunk: FrameChunk, first: int) -> FrameChunk:
+            start, every = time.perf_counter(), self.stages_every
+            metrics = tuple(
+                meter.measure(chunk, i, stages=every > 0 and (first + i) % every == 0)
+                for i in range(len(chunk.frames))
+            )
+            seconds = {**chunk.times.seconds, "measure": time.perf_counter() - start}
+            return replace(chunk, metrics=metrics, times=StageTimes(seconds), stages={})
+
+        return measured
 
 
 def _timed(clock: dict[str, float], stage: str, name: str, call: Callable[..., None], *args: object) -> None:
@@ -138,7 +152,7 @@ def _timed(clock: dict[str, float], stage: str, name: str, call: Callable[..., N
 def _report(
     job: ShotJob,
     draped: DrapedFrames,
-    options: DrapeOptions,
+    options: dict[str, Any],
     rows: list[dict[str, Any]],
     clock: dict[str, float],
     paths: dict[str, Path],
@@ -159,15 +173,18 @@ def _report(
             "resolution": job.resolution,
         },
         "layers": [_layer_row(layer) for layer in scene.layers],
-        "options": asdict(options),
-        "machine": machine(options.device),
+        "options": options,
+        "machine": machine(options["device"]),
         "seconds": {stage: round(s, 4) for stage, s in clock.items()},
         "milliseconds_per_frame": {
             stage: round(1000 * s / count, 2)
             for stage, s in clock.items()
             if stage not in ("prepare", "total")
         },
-        "peak_memory_mib": round(_peak_memory_mib(), 1),
+        "peak_memory_mib": round(_peak_memory_mib(resource.RUSAGE_SELF), 1),
+        "peak_memory_worker_mib": (
+            round(_peak_memory_mib(resource.RUSAGE_CHILDREN), 1) if options["workers"] > 1 else 0.0
+        ),
         "warnings": job_warnings(rows, scene.layers, job.shot),
         "summary": summarise(rows),
         "frames": rows,
@@ -186,8 +203,8 @@ def _layer_row(layer: Any) -> dict[str, Any]:
     }
 
 
-def _peak_memory_mib() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def _peak_memory_mib(who: int) -> float:
+    peak = resource.getrusage(who).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 

@@ -57,6 +57,16 @@ def job(**changes: object) -> ShotJob:
     return ShotJob.from_table(TABLE | changes, where="test")
 
 
+def test_two_processes_report_the_same_frames(tmp_path: Path) -> None:
+    options = DrapeOptions(chunk=1)
+    one, two = (run_job(job(write=["sheet"]), tmp_path / str(n), options=options, workers=n) for n in (1, 2))
+    assert one["frames"] == two["frames"]
+    assert one["summary"] == two["summary"]
+    assert (one["options"]["workers"], two["options"]["workers"]) == (1, 2)
+    assert one["peak_memory_worker_mib"] == 0 < two["peak_memory_worker_mib"]
+    assert two["milliseconds_per_frame"]["measure"] > 0
+
+
 def test_files_and_report(tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     report = run_job(job(), tmp_path, options=DrapeOptions(chunk=2), progress=lambda *step: done.append(step))

@@ -1,20 +1,18 @@
 """Independent tasks in separate processes, each with one thread."""
 
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
 from isp_assets.errors import DatasetError
+from isp_assets.processes import one_thread_each
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _RESTARTS = 3
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def run_tasks(
@@ -42,7 +40,7 @@ def run_tasks(
     for _ in range(_RESTARTS):
         if not remaining:
             return
-        with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), start) as pool:
+        with one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), start) as pool:
             futures = {pool.submit(work, task): task for task in remaining}
             try:
                 for future in as_completed(futures):
@@ -58,18 +56,3 @@ def run_tasks(
             f"worker processes died {_RESTARTS} times with {len(remaining)} tasks to go; use fewer workers, "
             "or check the memory; finished tasks are kept"
         )
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """BLAS and OpenMP read these when a child starts; two pools of threads hinder each other badly."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
