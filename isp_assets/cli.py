@@ -95,6 +95,9 @@ def drape(
         float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
     ] = 0.0,
     workers: WorkersOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the frames that an interrupted run has kept.")
+    ] = False,
 ) -> None:
     """Drape a shot file and write NAME.usdc, .glb, .rrd, .png and report.json."""
     from dataclasses import replace
@@ -112,13 +115,19 @@ def drape(
     if steps is not None:
         options = replace(options, steps=split_names(steps))
     with _progress() as (bar, task):
-        report = run_job(
-            job,
-            out,
-            options=options,
-            workers=workers or (1 if smoothing else min(available_cores(), _MOST_WORKERS)),
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+        try:
+            report = run_job(
+                job,
+                out,
+                options=options,
+                resume=resume,
+                workers=workers or (1 if smoothing else min(available_cores(), _MOST_WORKERS)),
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )
+        except KeyboardInterrupt:
+            if (kept := out / f"{job.shot.name}.frames").is_dir():
+                error_console.print(f"finished frames are kept in {_plain(str(kept))}; go on with --resume")
+            raise
     _print_report(report, job, out)
 
 

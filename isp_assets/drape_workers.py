@@ -8,7 +8,7 @@ processes are held, however long the shot.
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -28,7 +28,13 @@ Finish = Callable[[Scene], Complete]
 
 
 def drape_shot(
-    outfit: Outfit, shot: Shot, options: DrapeOptions, *, workers: int = 1, finish: Finish | None = None
+    outfit: Outfit,
+    shot: Shot,
+    options: DrapeOptions,
+    *,
+    workers: int = 1,
+    finish: Finish | None = None,
+    rows: Sequence[slice] | None = None,
 ) -> DrapedFrames:
     """Drape an outfit over a shot in one or several processes.
 
@@ -39,6 +45,7 @@ def drape_shot(
         workers: Processes, one thread each; 1 works in this process. A script that asks for more must
             guard its main part with ``if __name__ == "__main__"``.
         finish: What is done to every chunk in the process that draped it, such as measuring.
+        rows: The chunks wanted, of those that `chunk_rows` gives; all if left out.
 
     Raises:
         DrapeError: If several processes are asked to smooth over time, one of them dies, or as in `drape`.
@@ -49,7 +56,7 @@ def drape_shot(
             f"workers={workers}, smoothing={options.smoothing:g}: expected at least 1 process, and only 1 "
             "with smoothing, as frames then depend on those before; give --workers 1, or --smoothing 0"
         )
-    rows = chunk_rows(shot, options)
+    rows = chunk_rows(shot, options) if rows is None else rows
     workers = min(workers, len(rows))
     if workers <= 1:
         draper = Draper(outfit, shot, options)

@@ -13,13 +13,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from isp_assets.drape import DrapeOptions
+from isp_assets.drape import DrapeOptions, chunk_rows
 from isp_assets.drape_workers import Complete, drape_shot
-from isp_assets.errors import IspAssetsError, PluginError
+from isp_assets.errors import DrapeError, IspAssetsError, PluginError
 from isp_assets.evaluate.frames import FrameMeter, summarise
 from isp_assets.evaluate.job_warnings import job_warnings
 from isp_assets.evaluate.table import machine
 from isp_assets.files import write_text
+from isp_assets.frame_store import FrameStore, job_key
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.plugin import ShotWriter, make_writer
 from isp_assets.shot import ShotJob
@@ -30,6 +31,8 @@ REPORT_VERSION = 1
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
+_STAGES_EVERY = 8  # the earlier rungs of the ladder are measured on every n-th frame
+
 
 def run_job(
     job: ShotJob,
@@ -37,17 +40,19 @@ def run_job(
     *,
     options: DrapeOptions,
     workers: int = 1,
-    measure_stages_every: int = 8,
+    resume: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Drape a job and write its files and ``report.json`` into ``out``.
+
+    Until all is written, finished frames are kept in ``NAME.frames``, unless they are smoothed over time.
 
     Args:
         job: What to drape and which writers to run.
         out: Output folder; made if missing. Existing outputs are replaced whole.
         options: Device, steps and chunk size.
         workers: Processes that drape and measure; see `drape_shot`.
-        measure_stages_every: Measure the earlier rungs of the ladder on every n-th frame; 0 never.
+        resume: Go on from the frames that an interrupted run of the same job kept.
 
     Returns:
         The report, as written.
@@ -58,23 +63,40 @@ def run_job(
     started = time.perf_counter()
     writers = {name: make_writer(name) for name in job.write}
     clock: dict[str, float] = {}
-    draped = drape_shot(
-        job.outfit,
-        job.shot,
-        replace(options, resolution=job.resolution, keep_stages=measure_stages_every > 0),
-        workers=workers,
-        finish=Measuring(measure_stages_every),
-    )
-    clock["prepare"] = time.perf_counter() - started
     paths = {name: out / f"{job.shot.name}{writer.suffix}" for name, writer in writers.items()}
     _check_paths(paths)
+    options = replace(options, resolution=job.resolution, keep_stages=True)
+    draped, store = _draped(job, options, out, workers=workers, resume=resume)
+    clock["prepare"] = time.perf_counter() - started
     out.mkdir(parents=True, exist_ok=True)
     rows = _write_all(draped, writers, paths, clock, progress)
     clock["total"] = time.perf_counter() - started
     report = _report(job, draped, {**asdict(options), "workers": workers}, rows, clock, paths)
     text = json.dumps(report, indent=1, allow_nan=False)
     write_text(out / "report.json", text + "\n")
+    if store is not None:
+        store.clear()
     return json.loads(text)
+
+
+def _draped(
+    job: ShotJob, options: DrapeOptions, out: Path, *, workers: int, resume: bool
+) -> tuple[DrapedFrames, FrameStore | None]:
+    """The measured frames of a job, and where they are kept meanwhile."""
+    finish = Measuring(_STAGES_EVERY)
+    if options.smoothing:
+        if resume:
+            raise DrapeError(
+                "frames that are smoothed over time depend on those before and cannot be resumed; "
+                "leave --resume or --smoothing out"
+            )
+        return drape_shot(job.outfit, job.shot, options, workers=workers, finish=finish), None
+    key = job_key(job, options, stages_every=_STAGES_EVERY)
+    store = FrameStore(out / f"{job.shot.name}.frames", key, resume=resume)
+    rows = chunk_rows(job.shot, options)
+    missing = [part for part in rows if part.start not in store.finished]
+    draped = drape_shot(job.outfit, job.shot, options, workers=workers, finish=finish, rows=missing)
+    return store.complete(draped, rows), store
 
 
 def _check_paths(paths: dict[str, Path]) -> None:
@@ -120,7 +142,7 @@ class Measuring:
     """Measures every chunk, in the process that draped it."""
 
     stages_every: int
-    """Also measure the earlier rungs on every n-th frame; 0 never."""
+    """Also measure the earlier rungs on every n-th frame."""
 
     def __call__(self, scene: Scene) -> Complete:
         """What measures chunks of this scene; it drops the earlier rungs afterwards."""
@@ -129,8 +151,7 @@ class Measuring:
         def measured(chunk: FrameChunk, first: int) -> FrameChunk:
             start, every = time.perf_counter(), self.stages_every
             metrics = tuple(
-                meter.measure(chunk, i, stages=every > 0 and (first + i) % every == 0)
-                for i in range(len(chunk.frames))
+                meter.measure(chunk, i, stages=(first + i) % every == 0) for i in range(len(chunk.frames))
             )
             seconds = {**chunk.times.seconds, "measure": time.perf_counter() - start}
             return replace(chunk, metrics=metrics, times=StageTimes(seconds), stages={})

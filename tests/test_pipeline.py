@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from isp_assets import pipeline
-from isp_assets.drape import STEPS, DrapeOptions
-from isp_assets.errors import PluginError
+from isp_assets.drape import STEPS, DrapeOptions, Draper
+from isp_assets.errors import DrapeError, PluginError, ShotError
 from isp_assets.frames import FrameChunk, Scene
 from isp_assets.pipeline import run_job, split_names
 from isp_assets.shot import ShotJob
@@ -55,6 +55,35 @@ class Recorder:
 
 def job(**changes: object) -> ShotJob:
     return ShotJob.from_table(TABLE | changes, where="test")
+
+
+def test_an_interrupted_job_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = DrapeOptions(chunk=1)
+    whole = run_job(job(write=["sheet"]), tmp_path / "whole", options=options)
+    assert not (tmp_path / "whole" / "job.frames").exists()
+    with monkeypatch.context() as patch:
+        stopped = Recorder("add", KeyboardInterrupt)
+        patch.setattr(pipeline, "make_writer", lambda name: stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run_job(job(write=["recorder"]), tmp_path / "cut", options=options)
+    kept = tmp_path / "cut" / "job.frames"
+    assert {path.name for path in kept.iterdir()} == {"key.txt", "00000000.npz"}
+    with pytest.raises(ShotError, match="kept frames are of another job"):
+        run_job(job(outfit=["tank_top"]), tmp_path / "cut", options=options, resume=True)
+    draped = []
+    monkeypatch.setattr(
+        Draper, "chunk", lambda self, rows, plain=Draper.chunk: draped.append(rows.start) or plain(self, rows)
+    )
+    rest = run_job(job(write=["sheet"]), tmp_path / "cut", options=options, resume=True)
+    assert draped == [1, 2]
+    assert rest["frames"] == whole["frames"]
+    assert rest["summary"] == whole["summary"]
+    assert not kept.exists()
+
+
+def test_smoothed_frames_cannot_be_resumed(tmp_path: Path) -> None:
+    with pytest.raises(DrapeError, match="leave --resume or --smoothing out"):
+        run_job(job(), tmp_path, options=DrapeOptions(smoothing=0.5), resume=True)
 
 
 def test_two_processes_report_the_same_frames(tmp_path: Path) -> None:
@@ -107,7 +136,9 @@ def test_interrupt_aborts_the_writers(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(KeyboardInterrupt):
         run_job(job(write=["recorder"]), tmp_path, options=DrapeOptions())
     assert writer.calls == ["begin", "add", "abort"]
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == [
+        "job.frames"
+    ]  # what was finished is whole, and kept
 
 
 def test_two_writers_of_one_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
