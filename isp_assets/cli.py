@@ -68,6 +68,9 @@ WorkersOption = Annotated[
         min=1, help="Processes, 1 GB of memory each. [default: one a core, up to 8; 1 with smoothing]"
     ),
 ]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Go on from the frames that an interrupted run has kept.")
+]
 
 
 @app.command()
@@ -78,9 +81,11 @@ def demo(
     device: DeviceOption = Device.auto,
     steps: StepsOption = None,
     workers: WorkersOption = None,
+    resume: ResumeOption = False,
 ) -> None:
     """Drape the built-in outfit over the built-in walk and write every format."""
-    drape(Path(__file__).parent / "data" / "demo.toml", out, frames, write, device, steps, workers=workers)
+    shot = Path(__file__).parent / "data" / "demo.toml"
+    drape(shot, out, frames, write, device, steps, workers=workers, resume=resume)
 
 
 @app.command()
@@ -95,9 +100,7 @@ def drape(
         float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
     ] = 0.0,
     workers: WorkersOption = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the frames that an interrupted run has kept.")
-    ] = False,
+    resume: ResumeOption = False,
 ) -> None:
     """Drape a shot file and write NAME.usdc, .glb, .rrd, .png and report.json."""
     from dataclasses import replace

@@ -18,7 +18,7 @@ from isp_assets.drape import DrapeOptions, Draper, chunk_rows
 from isp_assets.errors import DrapeError
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene
 from isp_assets.outfit import Outfit
-from isp_assets.processes import one_thread_each
+from isp_assets.processes import end_with_parent, one_thread_each
 from isp_assets.shot import Shot
 
 Complete = Callable[[FrameChunk, int], FrameChunk]
@@ -93,8 +93,8 @@ def _in_order(
 def _explained(error: BaseException) -> BaseException:
     if isinstance(error, BrokenProcessPool):
         return DrapeError(
-            "a process that was draping died, most likely for want of memory (each takes about 1 GB); "
-            "use fewer workers"
+            "a process that was draping died, most likely for want of memory (each takes about 1 GB): use "
+            'fewer workers; a script must also guard its main part with: if __name__ == "__main__"'
         )
     return error
 
@@ -118,6 +118,7 @@ _worker: _Worker | None = None
 def _start(payload: bytes) -> None:
     global _payload
     _payload = payload
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends it without a word; the parent reports
 
 

@@ -7,7 +7,7 @@ from multiprocessing import get_context
 from typing import Any, TypeVar
 
 from isp_assets.errors import DatasetError
-from isp_assets.processes import one_thread_each
+from isp_assets.processes import end_with_parent, one_thread_each
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -40,7 +40,7 @@ def run_tasks(
     for _ in range(_RESTARTS):
         if not remaining:
             return
-        with one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), start) as pool:
+        with one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (start,)) as pool:
             futures = {pool.submit(work, task): task for task in remaining}
             try:
                 for future in as_completed(futures):
@@ -56,3 +56,8 @@ def run_tasks(
             f"worker processes died {_RESTARTS} times with {len(remaining)} tasks to go; use fewer workers, "
             "or check the memory; finished tasks are kept"
         )
+
+
+def _begin(start: Callable[[], Any]) -> None:
+    end_with_parent()
+    start()
