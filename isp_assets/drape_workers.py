@@ -11,8 +11,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
+from typing import Any
 
 from isp_assets.drape import DrapeOptions, Draper, chunk_rows
 from isp_assets.errors import DrapeError
@@ -62,41 +64,60 @@ def drape_shot(
         draper = Draper(outfit, shot, options)
         complete = finish(draper.scene) if finish else _as_it_is
         return DrapedFrames(draper.scene, (complete(draper.chunk(part), part.start) for part in rows))
-    pool = ProcessPoolExecutor(
-        workers, get_context("spawn"), _start, (pickle.dumps((outfit, shot, options, finish)),)
-    )
-    try:
-        with one_thread_each():  # the processes start with their first tasks
-            scene = pool.submit(_scene)
-            waiting = deque(pool.submit(_chunk, part) for part in rows[: workers + 1])
-        found = scene.result()
-    except BaseException as error:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise _explained(error) from error
-    return DrapedFrames(found, _in_order(pool, waiting, iter(rows[workers + 1 :])))
+    pool = _Pool((outfit, shot, options, finish), rows, workers)
+    return DrapedFrames(pool.scene(), pool.chunks())
 
 
-def _in_order(
-    pool: ProcessPoolExecutor, waiting: "deque[Future[FrameChunk]]", further: Iterator[slice]
-) -> Iterator[FrameChunk]:
-    try:
-        while waiting:
-            chunk = waiting.popleft().result()
-            waiting.extend(pool.submit(_chunk, part) for part in islice(further, 1))
-            yield chunk
-    except BaseException as error:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise _explained(error) from error
-    pool.shutdown()
+class _Pool:
+    """Processes that drape chunks, a few ahead of what has been taken.
 
+    Args:
+        payload: What `_Worker` is made of.
+        rows: The chunks wanted.
+        workers: Number of processes.
+    """
 
-def _explained(error: BaseException) -> BaseException:
-    if isinstance(error, BrokenProcessPool):
-        return DrapeError(
-            "a process that was draping died, most likely for want of memory (each takes about 1 GB): use "
-            'fewer workers; a script must also guard its main part with: if __name__ == "__main__"'
-        )
-    return error
+    def __init__(self, payload: tuple[Any, ...], rows: Sequence[slice], workers: int) -> None:
+        before = set(active_children())
+        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (pickle.dumps(payload),))
+        self._further = iter(rows)
+        with self._ended_on_error():
+            with one_thread_each():  # the processes start with their first tasks
+                self._scene = self._pool.submit(_scene)
+                self._waiting = deque(self._submit(workers + 1))
+            self._processes = set(active_children()) - before
+
+    def scene(self) -> Scene:
+        with self._ended_on_error():
+            return self._scene.result()
+
+    def chunks(self) -> Iterator[FrameChunk]:
+        with self._ended_on_error():
+            while self._waiting:
+                chunk = self._waiting.popleft().result()
+                self._waiting.extend(self._submit(1))
+                yield chunk
+        self._pool.shutdown()
+
+    def _submit(self, count: int) -> list["Future[FrameChunk]"]:
+        return [self._pool.submit(_chunk, part) for part in islice(self._further, count)]
+
+    @contextmanager
+    def _ended_on_error(self) -> Iterator[None]:
+        """Nobody waits for chunks that are in the making when draping ends early."""
+        try:
+            yield
+        except BaseException as error:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in getattr(self, "_processes", ()):
+                process.terminate()
+            if isinstance(error, BrokenProcessPool):
+                raise DrapeError(
+                    "a process that was draping died, most likely for want of memory (each takes about "
+                    "1 GB): use fewer workers; a script must also guard its main part with: "
+                    'if __name__ == "__main__"'
+                ) from error
+            raise
 
 
 def _as_it_is(chunk: FrameChunk, first: int) -> FrameChunk:
