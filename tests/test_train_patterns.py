@@ -9,6 +9,7 @@ from training_sets import tube_dataset
 
 from isp_assets.bundle import GarmentBundle
 from isp_assets.errors import DatasetError, TrainError
+from isp_assets.train import rehearsal
 from isp_assets.train.assemble import assemble_bundle
 from isp_assets.train.atlas import (
     AtlasOptions,
@@ -106,6 +107,24 @@ def test_atlases_are_trained_further_on_their_own_garments_only(trained):
         FurtherAtlasTask(replace(tube_dataset(), category="hose"), bundle, ATLAS, RunOptions(steps=1))
     with pytest.raises(TrainError, match=r"no codes for 1 of the dataset's 4 .*tube_3"):
         FurtherAtlasTask(tube_dataset((0.3, 0.4, 0.5, 0.6)), bundle, ATLAS, RunOptions(steps=1))
+
+
+@pytest.mark.parametrize("widths", [(0.4, 0.5), (0.4, 0.5, 0.9)])
+def test_garments_that_a_dataset_lacks_are_rehearsed(trained, widths, tmp_path, monkeypatch):
+    """The third tube is missing, or another one bears its name: the bundle shows what it was."""
+    monkeypatch.setattr(rehearsal, "_MOST_OTHERS", 0.5)
+    bundle = GarmentBundle.load(trained[1] / "atlas" / "tube.safetensors")
+    dataset = tube_dataset(widths)
+    found = rehearsal.rehearse(dataset, bundle)
+    assert [garment.name for garment in found.known.garments] == ["tube_0", "tube_1"]
+    assert found.rehearsed == ["tube_2"]
+    shown = found.all.garments[2]
+    assert np.ptp(shown.panels["front"].xy, axis=0) == pytest.approx([0.6, 0.5], abs=0.06)
+    assert shown.faces.max() < len(shown.rest_vertices)
+    assert len(seam_indices(shown)["front"]) > 10
+    run = RunOptions(steps=2, measurements=1)
+    train_atlas_further(dataset, bundle, tmp_path, run=run, options=replace(ATLAS, rate=1e-5))
+    assert GarmentBundle.load(tmp_path / "tube.safetensors").provenance["atlas"]["rehearsed"] == ["tube_2"]
 
 
 def test_slip_is_what_lies_along_the_triangle():

@@ -84,6 +84,7 @@ def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path)
     codes = np.stack([bundle.code(garment.name) for garment in dataset.garments])
     notes = _run_notes(manifest) | {
         "dataset_sha256": manifest["config"]["dataset_sha256"],
+        "rehearsed": manifest["config"].get("rehearsed", []),
         "earlier": bundle.provenance.get("atlas", {}),
     }
     table, every = torch.from_numpy(codes), range(len(dataset.garments))

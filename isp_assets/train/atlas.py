@@ -29,11 +29,10 @@ from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places
 from isp_assets.train.dataset import GarmentDataset
 from isp_assets.train.loop import CHECKPOINT, RunOptions, RunReport, read_checkpoint, train
 from isp_assets.train.patterns import dataset_digest
+from isp_assets.train.rehearsal import rehearse
 
 FURTHER_RATE = 6e-4
 """Peak learning rate of atlases that are trained already."""
-_SAME_SHAPES = 20.0
-"""Mean error of a bundle's atlases up to which a dataset is the one that it was trained on [mm]."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,8 @@ def train_atlas_further(
 ) -> RunReport:
     """Train a bundle's atlases further, and write the bundle, ``<category>.safetensors``.
 
-    Codes and panel fields stay, and with them the displacements.
+    Codes and panel fields stay, and with them the displacements. Garments of the bundle that the dataset
+    lacks, or holds in another shape, are trained on as the bundle decodes them.
 
     Args:
         dataset: The dataset that the bundle was trained on, or a part of it.
@@ -108,7 +108,7 @@ def train_atlas_further(
     """
     task = FurtherAtlasTask(dataset, bundle, options or AtlasOptions(rate=FURTHER_RATE), run)
     report = train(task, folder, run)
-    new = renew_atlases(dataset, bundle, folder / CHECKPOINT)
+    new = renew_atlases(task.known, bundle, folder / CHECKPOINT)
     new.save(folder / f"{dataset.category}.safetensors")
     return report
 
@@ -210,15 +210,12 @@ class FurtherAtlasTask(_AtlasTask):
             atlas.requires_grad_(True)
         one = next(iter(atlases.values())).config
         options = replace(options, width=one.width, depth=one.depth, skip=one.skip)
-        codes = torch.from_numpy(np.stack([bundle.code(garment.name) for garment in dataset.garments]))
-        super().__init__(dataset, codes, atlases, options, run, {"bundle_sha256": bundle.model_sha256})
         # Made again on another machine, a dataset differs in its last bits: its shapes tell, not its digest.
-        if (error := self.measure()["vertex_mm"]) > _SAME_SHAPES:
-            raise TrainError(
-                f"the bundle {bundle.category!r} misses the dataset's garments by {error:.1f} mm, expected "
-                f"at most {_SAME_SHAPES:g}: they are other garments of the same names; give the dataset that "
-                "it was trained on, or train patterns anew"
-            )
+        found = rehearse(dataset, bundle)
+        self.known = found.known
+        codes = torch.from_numpy(np.stack([bundle.code(garment.name) for garment in found.all.garments]))
+        origin = {"bundle_sha256": bundle.model_sha256, "rehearsed": found.rehearsed}
+        super().__init__(found.all, codes, atlases, options, run, origin)
 
 
 def weigh_slip(
