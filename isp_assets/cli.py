@@ -60,8 +60,6 @@ StepsOption = Annotated[
     str | None,
     typer.Option("--steps", help="Rungs to run, of skin,displace,tuck,layering,project (for comparisons)."),
 ]
-
-
 WorkersOption = Annotated[
     int | None,
     typer.Option(

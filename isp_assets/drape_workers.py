@@ -1,6 +1,6 @@
 """Drape a shot in several processes, which take chunks of frames in turn; chunks come back in order.
 
-A frame depends on its own pose alone, so the number of processes changes nothing but the time.
+A frame depends on its own pose alone: with one thread each, their number changes nothing but the time.
 Every process decodes and binds the outfit once; at most two chunks more than there are
 processes are held, however long the shot.
 """

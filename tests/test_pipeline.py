@@ -136,9 +136,8 @@ def test_interrupt_aborts_the_writers(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(KeyboardInterrupt):
         run_job(job(write=["recorder"]), tmp_path, options=DrapeOptions())
     assert writer.calls == ["begin", "add", "abort"]
-    assert [path.name for path in tmp_path.iterdir()] == [
-        "job.frames"
-    ]  # what was finished is whole, and kept
+    # What was finished is whole, and kept.
+    assert [path.name for path in tmp_path.iterdir()] == ["job.frames"]
 
 
 def test_two_writers_of_one_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
