@@ -11,6 +11,7 @@ from torch import nn
 
 from isp_assets.errors import TrainError
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
+from isp_assets.train.optimizers import OptimizerName
 
 
 class LineTask:
@@ -19,9 +20,11 @@ class LineTask:
     name = "line"
 
     def __init__(
-        self, *, width: int = 4, interrupt_at: int | None = None, poison_at: int | None = None
-    ) -> None:
+        self, *, width: int = 4, interrupt_at: int | None = None, poison_at: int | None = None,
+        optimizer: OptimizerName = "adam",
+    ) -> None:  # fmt: skip
         torch.manual_seed(1)
+        self.optimizer = optimizer
         self.config = {"width": width, "sizes": (1, width)}
         self.module = nn.Sequential(nn.Linear(1, width), nn.Tanh(), nn.Linear(width, 1))
         self.interrupt_at, self.poison_at, self.calls = interrupt_at, poison_at, 0
@@ -82,12 +85,13 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
     assert not torch.equal(a["0.weight"], c["0.weight"])
 
 
-def test_an_interrupted_run_resumes_to_the_bit(tmp_path):
-    train(LineTask(), tmp_path / "whole", run())
+@pytest.mark.parametrize("optimizer", ["adam", "soap"])
+def test_an_interrupted_run_resumes_to_the_bit(tmp_path, optimizer):
+    train(LineTask(optimizer=optimizer), tmp_path / "whole", run())
     with pytest.raises(KeyboardInterrupt, match="step 17"):
-        train(LineTask(interrupt_at=17), tmp_path / "parts", run())
+        train(LineTask(interrupt_at=17, optimizer=optimizer), tmp_path / "parts", run())
     assert read_checkpoint(tmp_path / "parts" / CHECKPOINT)[1]["step"] == 17
-    report = train(LineTask(), tmp_path / "parts", run(resume=True))
+    report = train(LineTask(optimizer=optimizer), tmp_path / "parts", run(resume=True))
     whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
     assert report.steps == 40
     assert all(torch.equal(whole[k], parts[k]) for k in whole)

@@ -28,6 +28,7 @@ from isp_assets.train.atlas_metrics import measure_atlases
 from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places
 from isp_assets.train.dataset import GarmentDataset
 from isp_assets.train.loop import CHECKPOINT, RunOptions, RunReport, read_checkpoint, train
+from isp_assets.train.optimizers import OptimizerName
 from isp_assets.train.patterns import dataset_digest
 from isp_assets.train.rehearsal import rehearse
 
@@ -48,7 +49,8 @@ class AtlasOptions:
     """lambda_n of Eq. 4."""
     seam_weight: float = 0.5
     """lambda_c of Eq. 4, but of the gap itself: its square, as in the paper, fades before the gap does."""
-    rate: float = 1.5e-3
+    rate: float = 3e-3
+    optimizer: OptimizerName = "soap"
     garments_per_step: int = 24
     faces_per_step: int = 24
     """Triangles a garment and panel; all three corners are evaluated."""
@@ -131,6 +133,7 @@ class _AtlasTask:
     ) -> None:  # fmt: skip
         self.name = f"atlas {dataset.category}"
         self.options, self.dataset, self.device = options, dataset, torch.device(run.device)
+        self.optimizer = options.optimizer
         self.codes = codes.to(self.device)
         self.module = nn.ModuleDict(dict(atlases)).to(self.device)
         self.config: Mapping[str, Any] = {

@@ -32,6 +32,7 @@ from isp_assets.skinning import shape_garment, skin_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
+from isp_assets.train.optimizers import OptimizerName
 from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
 from isp_assets.train.wardrobe import WardrobeOptions, WornSample, build_wardrobe
 
@@ -52,6 +53,7 @@ class DisplacementOptions:
     garments: int = 2
     """Garments a step, all in the same poses."""
     learning_rate: float = 1e-3
+    optimizer: OptimizerName = "adam"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,9 @@ class DisplacementTask:
             "field": config.to_dict(), "contact": asdict(options.contact), "body": body.sha256,
             "wardrobe": asdict(options.wardrobe), "frames": options.frames, "garments": options.garments,
             "held_out": list(options.poses.held_out), "learning_rate": options.learning_rate,
+            "optimizer": options.optimizer,
         }  # fmt: skip
+        self.optimizer = options.optimizer
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)

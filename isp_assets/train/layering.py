@@ -32,6 +32,7 @@ from isp_assets.skinning import shape_garment
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
+from isp_assets.train.optimizers import OptimizerName
 from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
 from isp_assets.train.wardrobe import WardrobeOptions
 from isp_assets.train.wearers import Wearer, build_wearers
@@ -63,6 +64,7 @@ class LayeringOptions:
     deep_share: float = 0.5
     """Share of the stacks that have three layers."""
     learning_rate: float = 1e-3
+    optimizer: OptimizerName = "adam"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +97,10 @@ class LayeringTask:
             "held_out": [options.held_out, *options.poses.held_out], "frames": options.frames,
             "layer_weight": options.layer_weight, "regular_weight": options.regular_weight,
             "deep_share": options.deep_share, "learning_rate": options.learning_rate,
+            "optimizer": options.optimizer,
         }  # fmt: skip
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
+        self.optimizer = options.optimizer
         self.body = body.to(self.device)
         self.module = LayeringNet(options.network).to(self.device)
         wardrobe = WardrobeOptions(

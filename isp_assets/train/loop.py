@@ -21,10 +21,11 @@ from isp_assets.errors import TrainError
 from isp_assets.storage import load_tensors, save_tensors
 from isp_assets.train.cpu import prepare_cpu
 from isp_assets.train.history import History
+from isp_assets.train.optimizers import OptimizerName, make_optimizer, restore_state, state_tensors
 from isp_assets.train.progress import ProgressView, interrupt_flag
 
 CHECKPOINT = "checkpoint.safetensors"
-_SCHEMA, _VERSION = "isp-assets/checkpoint", 1
+_SCHEMA, _VERSION = "isp-assets/checkpoint", 2
 
 
 @runtime_checkable
@@ -32,6 +33,7 @@ class Task(Protocol):
     """What is trained."""
 
     name: str
+    optimizer: OptimizerName
     config: Mapping[str, Any]
     """Plain JSON values that a checkpoint must share with the task that resumes it."""
 
@@ -40,7 +42,7 @@ class Task(Protocol):
         """Owns every parameter."""
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Groups for Adam, each with its peak ``lr``."""
+        """Groups for the optimizer, each with its peak ``lr``."""
 
     def losses(self, generator: torch.Generator, progress: float) -> Mapping[str, Tensor]:
         """Weighted terms of one random batch; their sum is minimised. ``progress`` runs from 0 to 1."""
@@ -144,7 +146,7 @@ class _Run:
     def __init__(self, task: Task, folder: Path, options: RunOptions) -> None:
         self.task, self.folder, self.options = task, folder, options
         self.generator = torch.Generator().manual_seed(options.seed)
-        self.optimizer = torch.optim.Adam(task.parameter_groups(), fused=True)
+        self.optimizer = make_optimizer(task.optimizer, task.parameter_groups())
         self.peaks = [group["lr"] for group in self.optimizer.param_groups]
         self.history = History(folder / "history.csv")
         self.step, self.seconds = 0, 0.0
@@ -212,14 +214,14 @@ class _Run:
     def save(self) -> None:
         self._saved = self.seconds
         tensors = {f"module.{name}": value for name, value in self.task.module.state_dict().items()}
-        for index, state in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
+        state, rest = state_tensors(self.optimizer)
+        tensors |= {f"optimizer.{name}": value for name, value in state.items()}
         tensors["random.task"] = self.generator.get_state()
         tensors["random.torch"] = torch.get_rng_state()
         manifest = {
             "task": self.task.name, "config": self.task.config, "seed": self.options.seed, "step": self.step,
             "seconds": self.seconds, "metrics": self.metrics, "measured": self._measured,
-            "device": self.options.device, "threads": torch.get_num_threads(),
+            "device": self.options.device, "threads": torch.get_num_threads(), "optimizer": rest,
         }  # fmt: skip
         save_tensors(self.folder / CHECKPOINT, tensors, manifest, schema=_SCHEMA, version=_VERSION)
 
@@ -236,12 +238,8 @@ class _Run:
             )
         weights, _ = read_checkpoint(path)
         self.task.module.load_state_dict(weights)
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, value in tensors.items():
-            if name.startswith("optimizer."):
-                _, index, field = name.split(".")
-                state.setdefault(int(index), {})[field] = value
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state})
+        state = {name.removeprefix("optimizer."): t for name, t in tensors.items()}
+        restore_state(self.optimizer, state, manifest["optimizer"])
         self.generator.set_state(tensors["random.task"])
         torch.set_rng_state(tensors["random.torch"])
         self.step, self.seconds = manifest["step"], manifest["seconds"]

@@ -20,6 +20,7 @@ from isp_assets.errors import DatasetError
 from isp_assets.networks.panel_field import PanelField, PanelFieldConfig
 from isp_assets.train.dataset import GarmentDataset, TrainingPanel
 from isp_assets.train.loop import RunOptions, RunReport, train
+from isp_assets.train.optimizers import LOOKUP, OptimizerName
 from isp_assets.train.pattern_metrics import measure_fields
 from isp_assets.train.sampling import Outline, SamplingOptions, sample_panel
 
@@ -29,6 +30,8 @@ class PatternOptions:
     """Networks and losses of the pattern training."""
 
     code_size: int = 32
+    code_spread: float = 0.1
+    """Standard deviation of the random numbers that codes start from."""
     width: int = 128
     depths: tuple[int, int, int] = (3, 6, 4)
     """Layers: shared, then of the distance branch, and of the label branch."""
@@ -36,7 +39,8 @@ class PatternOptions:
     """lambda_CE of Eq. 2."""
     code_weight: float = 1e-4
     """lambda_reg of Eq. 2; keeps codes close together, so that what lies between them is a garment too."""
-    field_rate: float = 1.5e-3
+    optimizer: OptimizerName = "soap"
+    field_rate: float = 3e-3
     code_rate: float = 2e-3
     garments_per_step: int = 24
     points_per_step: int = 96
@@ -68,10 +72,10 @@ def train_patterns(
 class PatternNetworks(nn.Module):
     """A panel field for each panel, and the codes that they share."""
 
-    def __init__(self, config: PanelFieldConfig, num_garments: int) -> None:
+    def __init__(self, config: PanelFieldConfig, num_garments: int, code_spread: float) -> None:
         super().__init__()
         self.fields = nn.ModuleDict({side: PanelField(config) for side in PANELS})
-        self.codes = nn.Parameter(0.1 * torch.randn(num_garments, config.code_size))
+        self.codes = nn.Parameter(code_spread * torch.randn(num_garments, config.code_size))
 
 
 class PatternTask:
@@ -82,9 +86,12 @@ class PatternTask:
             raise DatasetError(f"category {dataset.category!r}: the dataset holds no garment")
         self.name = f"patterns {dataset.category}"
         self.options, self.dataset, self.device = options, dataset, torch.device(run.device)
+        self.optimizer = options.optimizer
         torch.manual_seed(run.seed)
         config = options.field_config(max(dataset.edge_names))
-        self.module: PatternNetworks = PatternNetworks(config, len(dataset.garments)).to(self.device)
+        self.module: PatternNetworks = PatternNetworks(config, len(dataset.garments), options.code_spread).to(
+            self.device
+        )
         self.config: Mapping[str, Any] = {
             "options": asdict(options), "field": config.to_dict(), "category": dataset.category,
             "garments": [garment.name for garment in dataset.garments],
@@ -95,7 +102,7 @@ class PatternTask:
     def parameter_groups(self) -> list[dict[str, Any]]:
         return [
             {"params": list(self.module.fields.parameters()), "lr": self.options.field_rate},
-            {"params": [self.module.codes], "lr": self.options.code_rate},
+            {"params": [self.module.codes], "lr": self.options.code_rate, **LOOKUP},
         ]
 
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:

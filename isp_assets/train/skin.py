@@ -26,6 +26,7 @@ from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.train.garment_maker import CATEGORIES
 from isp_assets.train.loop import RunOptions, RunReport, train
+from isp_assets.train.optimizers import OptimizerName
 
 _HELD_OUT = 1500
 _STEP = 0.005  # length over which smoothness is measured [m]
@@ -65,6 +66,7 @@ class SkinTask:
     """What `train` needs: the field, its target, losses and metrics."""
 
     name = "skin"
+    optimizer: OptimizerName = "adam"
 
     def __init__(
         self, body: Body, config: SkinFieldConfig, diffusion: Diffusion, *,

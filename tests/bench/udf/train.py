@@ -34,6 +34,7 @@ class UdfOptions:
     gradient_weight: float = 0.0
     """Of the angle between the field's gradient and the true one."""
     code_weight: float = 1e-4
+    optimizer: OptimizerName = "adam"
     field_rate: float = 1.5e-3
     code_rate: float = 2e-3
     garments_per_step: int = 24
@@ -57,6 +58,7 @@ class UdfTask:
     def __init__(self, dataset: GarmentDataset, options: UdfOptions, run: RunOptions) -> None:
         self.name = f"udf {dataset.category}"
         self.options, self.dataset, self.device = options, dataset, torch.device(run.device)
+        self.optimizer = options.optimizer
         torch.manual_seed(run.seed)
         center, scale = unit_box(dataset)
         config = UdfConfig(
@@ -85,7 +87,7 @@ class UdfTask:
     def parameter_groups(self) -> list[dict[str, Any]]:
         return [
             {"params": list(self.module.field.parameters()), "lr": self.options.field_rate},
-            {"params": [self.module.codes], "lr": self.options.code_rate},
+            {"params": [self.module.codes], "lr": self.options.code_rate, **LOOKUP},
         ]
 
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
