@@ -27,7 +27,7 @@ from isp_assets.train.patterns import PatternOptions, dataset_digest, panel_outl
 from isp_assets.train.sampling import SamplingOptions
 
 PATTERNS = PatternOptions(code_size=4, width=24, field_rate=3e-3, sampling=SamplingOptions(points=2000))
-ATLAS = AtlasOptions(width=24, depth=4, skip=2, rate=3e-3)
+ATLAS = AtlasOptions(width=24, depth=4, skip=2, fold_size=2)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_the_bundle_knows_the_garments(trained):
     assert bundle.metrics["float32"]["atlas"]["vertex_mm"] == pytest.approx(
         bundle.metrics["atlas"]["vertex_mm"], rel=0.02
     )
-    assert len(bundle.metrics["codes"]["std"]) == 4
+    assert len(bundle.metrics["codes"]["std"]) == 4 + 2
     assert bundle.provenance["patterns"]["step"] == 300
     assert bundle.provenance["dataset_sha256"] == dataset_digest(dataset)
     garment = bundle.decode("tube_1", resolution=48)
@@ -125,6 +125,31 @@ def test_garments_that_a_dataset_lacks_are_rehearsed(trained, widths, tmp_path, 
     run = RunOptions(steps=2, measurements=1)
     train_atlas_further(dataset, bundle, tmp_path, run=run, options=replace(ATLAS, rate=1e-5))
     assert GarmentBundle.load(tmp_path / "tube.safetensors").provenance["atlas"]["rehearsed"] == ["tube_2"]
+
+
+def test_fold_codes_tell_apart_garments_of_one_pattern_and_leave_the_pattern_alone(tmp_path):
+    dataset = tube_dataset((0.4, 0.4))
+    bulged = dataset.garments[1].rest_vertices + np.array([0.0, 0.0, 0.02])
+    garments = (dataset.garments[0], replace(dataset.garments[1], rest_vertices=bulged))
+    dataset = replace(dataset, garments=garments)
+    options = replace(PATTERNS, code_spread=0.0)
+    train_patterns(dataset, tmp_path / "p", run=RunOptions(steps=20, measurements=1), options=options)
+    errors = {}
+    for size in (0, 2):
+        train_atlas(
+            dataset, tmp_path / "p" / CHECKPOINT, tmp_path / f"{size}",
+            run=RunOptions(steps=400, hold=0.2, measurements=1), options=replace(ATLAS, fold_size=size),
+        )  # fmt: skip
+        bundle = GarmentBundle.load(tmp_path / f"{size}" / "tube.safetensors")
+        errors[size] = bundle.metrics["atlas"]["vertex_mm"]
+    assert errors[0] > 9.5  # in the middle between the two
+    assert errors[2] < 0.5 * errors[0]
+    xy = torch.linspace(-0.9, 0.9, 40).reshape(20, 2)
+    code = torch.from_numpy(bundle.code("tube_0"))
+    other = code + torch.tensor([0.0] * 4 + [3.0, -5.0])
+    for field in bundle.model.panel_fields.values():
+        for one, two in zip(field(xy, code), field(xy, other), strict=True):
+            assert torch.equal(one, two)
 
 
 def test_slip_is_what_lies_along_the_triangle():

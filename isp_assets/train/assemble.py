@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import nn
 
 import isp_assets
@@ -46,16 +47,21 @@ def assemble_bundle(
         TrainError: If the two checkpoints do not belong together.
     """
     pattern_weights, pattern_manifest = read_checkpoint(patterns)
-    maps, atlas_manifest = _read_atlases(atlases)
+    maps, folds, atlas_manifest = _read_atlases(atlases)
     _check_pair(patterns, pattern_manifest, atlases, atlas_manifest)
     field_config = PanelFieldConfig.from_dict(pattern_manifest["config"]["field"])
-    fields = {side: _load(PanelField(field_config), pattern_weights, f"fields.{side}.") for side in PANELS}
+    fields = {
+        side: blind_to_folds(
+            _load(PanelField(field_config), pattern_weights, f"fields.{side}."), folds.shape[1]
+        )
+        for side in PANELS
+    }
     model = GarmentModel(
         category=dataset.category, panel_fields=fields, atlases=maps, edge_names=dict(dataset.edge_names),
         seam_pairs=tuple(dataset.seam_pairs), anchor_labels=tuple(dataset.anchor_labels),
         rest_pose=dataset.rest_pose, panel_center=dataset.panel_center, panel_scale=dataset.panel_scale,
     )  # fmt: skip
-    codes = pattern_weights["codes"].numpy()
+    codes = torch.cat([pattern_weights["codes"], folds], dim=1).numpy()
     stored = model if dtype == "float32" else _rounded(model)
     metrics = measure_model(stored, codes, dataset) | {"codes": _spread(codes)}
     if stored is not model:
@@ -78,7 +84,7 @@ def renew_atlases(dataset: GarmentDataset, bundle: GarmentBundle, atlases: Path)
     Raises:
         BundleError: If the checkpoint cannot be read.
     """
-    maps, manifest = _read_atlases(atlases)
+    maps, _, manifest = _read_atlases(atlases)
     model = replace(bundle.model, atlases=maps)
     stored = _rounded(model)
     codes = np.stack([bundle.code(garment.name) for garment in dataset.garments])
@@ -118,11 +124,24 @@ def _check_pair(patterns: Path, first: Mapping[str, Any], atlases: Path, second:
             )
 
 
-def _read_atlases(path: Path) -> tuple[dict[str, Atlas], dict[str, Any]]:
-    """The atlases of a checkpoint by panel, and its manifest."""
+def blind_to_folds(field: PanelField, fold_size: int) -> PanelField:
+    """A panel field that takes fold codes after the code, and ignores them."""
+    if not fold_size:
+        return field
+    config = replace(field.config, code_size=field.config.code_size + fold_size)
+    state = field.state_dict()
+    for branch in ("shared", "distance", "label"):  # the code is the last input of each
+        weight = state[f"{branch}.layers.0.weight"]
+        state[f"{branch}.layers.0.weight"] = nn.functional.pad(weight, (0, fold_size))
+    return _load(PanelField(config), state, "")
+
+
+def _read_atlases(path: Path) -> tuple[dict[str, Atlas], Float[torch.Tensor, "G F"], dict[str, Any]]:
+    """The atlases of a checkpoint by panel, the fold codes learnt with them, and its manifest."""
     weights, manifest = read_checkpoint(path)
     configs = {side: AtlasConfig.from_dict(manifest["config"]["atlas"][side]) for side in PANELS}
-    return {side: _load(Atlas(configs[side]), weights, f"{side}.") for side in PANELS}, manifest
+    maps = {side: _load(Atlas(configs[side]), weights, f"atlases.{side}.") for side in PANELS}
+    return maps, weights.get("folds", torch.zeros(manifest["config"]["garments"], 0)), manifest
 
 
 def _load(network: Any, weights: Mapping[str, torch.Tensor], prefix: str) -> Any:

@@ -1,8 +1,11 @@
-"""Training of the atlases, with the garments' codes held fixed.
+"""Training of the atlases, with the codes of the garments' patterns held fixed.
 
 The paper compares point clouds by Chamfer distance. Here each panel point's place
 on the body is known exactly, so the distance to that place is minimised directly. An
 error along the surface leaves the shape as it is and counts less than one across it.
+
+Cloth of one pattern may come to rest in several ways. Codes therefore get further numbers,
+the fold codes, which are learnt with the atlases and which the panel fields do not see.
 
 Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
 Implicit Sewing Patterns", NeurIPS 2023, Eqs. 3-4.
@@ -28,7 +31,7 @@ from isp_assets.train.atlas_metrics import measure_atlases
 from isp_assets.train.atlas_samples import AtlasSamples, network_xy, places
 from isp_assets.train.dataset import GarmentDataset
 from isp_assets.train.loop import CHECKPOINT, RunOptions, RunReport, read_checkpoint, train
-from isp_assets.train.optimizers import OptimizerName
+from isp_assets.train.optimizers import LOOKUP, OptimizerName
 from isp_assets.train.patterns import dataset_digest
 from isp_assets.train.rehearsal import rehearse
 
@@ -49,6 +52,11 @@ class AtlasOptions:
     """lambda_n of Eq. 4."""
     seam_weight: float = 0.5
     """lambda_c of Eq. 4, but of the gap itself: its square, as in the paper, fades before the gap does."""
+    fold_size: int = 16
+    """Numbers of a fold code; 0 for none. Of new atlases: further training keeps whole codes."""
+    fold_weight: float = 3e-5
+    """Of a fold code's square [m]; keeps them close together, as lambda_reg of Eq. 2 does codes."""
+    fold_rate: float = 2e-3
     rate: float = 3e-3
     optimizer: OptimizerName = "soap"
     garments_per_step: int = 24
@@ -115,13 +123,33 @@ def train_atlas_further(
     return report
 
 
+class AtlasNetworks(nn.Module):
+    """The atlases of both panels, and the fold codes, if there are any to learn."""
+
+    folds: nn.Parameter | None
+
+    def __init__(self, atlases: Mapping[str, Atlas], num_garments: int, fold_size: int) -> None:
+        super().__init__()
+        self.atlases = nn.ModuleDict(dict(atlases))
+        # They start equal: what tells garments apart is learnt, not drawn.
+        folds = nn.Parameter(torch.zeros(num_garments, fold_size)) if fold_size else None
+        self.register_parameter("folds", folds)
+
+    def whole(self, codes: Float[Tensor, "G Z"], garment: Tensor | slice) -> Float[Tensor, "g C"]:
+        """Whole codes of some garments, given the pattern codes of all."""
+        if self.folds is None:
+            return codes[garment]
+        return torch.cat([codes[garment], self.folds[garment]], dim=1)
+
+
 class _AtlasTask:
     """Eq. 4 on random garments, triangles and seam vertices.
 
     Args:
         dataset: Garments to learn from.
-        codes: Their codes.
+        codes: Their codes, without the fold codes that are to be learnt.
         atlases: Networks to train.
+        fold_size: Numbers of a fold code.
         options: Losses.
         run: Where to train.
         origin: What the codes come from; a checkpoint must share it.
@@ -129,30 +157,34 @@ class _AtlasTask:
 
     def __init__(
         self, dataset: GarmentDataset, codes: Float[Tensor, "G Z"], atlases: Mapping[str, Atlas],
-        options: AtlasOptions, run: RunOptions, origin: Mapping[str, Any],
+        fold_size: int, options: AtlasOptions, run: RunOptions, origin: Mapping[str, Any],
     ) -> None:  # fmt: skip
         self.name = f"atlas {dataset.category}"
         self.options, self.dataset, self.device = options, dataset, torch.device(run.device)
         self.optimizer = options.optimizer
         self.codes = codes.to(self.device)
-        self.module = nn.ModuleDict(dict(atlases)).to(self.device)
+        self.module: AtlasNetworks = AtlasNetworks(atlases, len(dataset.garments), fold_size).to(self.device)
         self.config: Mapping[str, Any] = {
             "options": asdict(options),
             "atlas": {side: atlas.config.to_dict() for side, atlas in atlases.items()},
-            "category": dataset.category, "dataset_sha256": dataset_digest(dataset), **origin,
+            "category": dataset.category, "garments": len(dataset.garments),
+            "dataset_sha256": dataset_digest(dataset), **origin,
         }  # fmt: skip
         self.samples = AtlasSamples(dataset, self.device)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        return [{"params": list(self.module.parameters()), "lr": self.options.rate}]
+        groups = [{"params": list(self.module.atlases.parameters()), "lr": self.options.rate}]
+        if self.module.folds is not None:
+            groups.append({"params": [self.module.folds], "lr": self.options.fold_rate, **LOOKUP})
+        return groups
 
     def losses(self, generator: torch.Generator, progress: float) -> dict[str, Tensor]:
         options, count = self.options, len(self.dataset.garments)
         garment = torch.randperm(count, generator=generator)[: options.garments_per_step]
-        codes = self.codes[garment.to(self.device)][:, None]
+        codes = self.module.whole(self.codes, garment.to(self.device))[:, None]
         seam = self.samples.seams(garment, options.seams_per_step, generator)
         place, normal, sewn = [], [], []
-        for side, atlas in self.module.items():
+        for side, atlas in self.module.atlases.items():
             corners = self.samples.triangles(side, garment, options.faces_per_step, generator)
             batch = torch.cat([corners.flatten(1, 2), seam[side]], dim=1)
             found = atlas(batch[..., :2], codes)
@@ -163,7 +195,9 @@ class _AtlasTask:
             cosine = nn.functional.cosine_similarity(_normal(faces), _normal(true), dim=-1)
             normal.append(1 - cosine.mean())
             sewn.append(on_seam)
+        folds = codes[..., self.codes.shape[1] :]
         return {
+            "fold": options.fold_weight * folds.square().sum(-1).mean(),
             "place": torch.stack(place).sum(),
             "normal": options.normal_weight * torch.stack(normal).sum(),
             "seam": options.seam_weight * (sewn[0] - sewn[1]).norm(dim=-1).mean(),
@@ -171,7 +205,9 @@ class _AtlasTask:
 
     def measure(self) -> dict[str, float]:
         chosen = np.unique(np.linspace(0, len(self.dataset.garments) - 1, 12).astype(int))
-        return measure_atlases(dict(self.module.items()), self.codes, self.dataset, garments=chosen.tolist())
+        codes = self.module.whole(self.codes, slice(None)).detach()
+        atlases = dict(self.module.atlases.items())
+        return measure_atlases(atlases, codes, self.dataset, garments=chosen.tolist())
 
 
 class AtlasTask(_AtlasTask):
@@ -186,11 +222,12 @@ class AtlasTask(_AtlasTask):
                 f"{patterns}: these patterns were trained on another dataset; train patterns again"
             )
         torch.manual_seed(run.seed)
-        size = weights["codes"].shape[1]
+        size = weights["codes"].shape[1] + options.fold_size
         atlases = {side: Atlas(_atlas_config(dataset, side, options, size)) for side in PANELS}
         super().__init__(
-            dataset, weights["codes"], atlases, options, run, {"patterns_step": manifest["step"]}
-        )
+            dataset, weights["codes"], atlases, options.fold_size, options, run,
+            {"patterns_step": manifest["step"]},
+        )  # fmt: skip
 
 
 class FurtherAtlasTask(_AtlasTask):
@@ -218,7 +255,7 @@ class FurtherAtlasTask(_AtlasTask):
         self.known = found.known
         codes = torch.from_numpy(np.stack([bundle.code(garment.name) for garment in found.all.garments]))
         origin = {"bundle_sha256": bundle.model_sha256, "rehearsed": found.rehearsed}
-        super().__init__(found.all, codes, atlases, options, run, origin)
+        super().__init__(found.all, codes, atlases, 0, options, run, origin)
 
 
 def weigh_slip(

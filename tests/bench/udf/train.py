@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from isp_assets.train.dataset import GarmentDataset, load_dataset
 from isp_assets.train.loop import RunOptions, RunReport, train
+from isp_assets.train.optimizers import LOOKUP, OptimizerName
 from isp_assets.train.patterns import dataset_digest
 
 
@@ -163,12 +164,17 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--width", type=int, default=UdfOptions.width)
     parser.add_argument("--output", choices=("hypot", "sigmoid"), default=UdfOptions.output)
+    parser.add_argument("--optimizer", choices=("adam", "soap"), default=UdfOptions.optimizer)
+    parser.add_argument("--rate", type=float, default=UdfOptions.field_rate)
     parser.add_argument("--gradient-weight", type=float, default=UdfOptions.gradient_weight)
     given = parser.parse_args()
     run = RunOptions(
         steps=given.steps, minutes=given.minutes, seed=given.seed, device=given.device, resume=given.resume
     )
-    options = UdfOptions(width=given.width, output=given.output, gradient_weight=given.gradient_weight)
+    options = UdfOptions(
+        width=given.width, output=given.output, gradient_weight=given.gradient_weight,
+        optimizer=given.optimizer, field_rate=given.rate,
+    )  # fmt: skip
     report = train_udf(load_dataset(given.data, given.category), given.out, run=run, options=options)
     figures = "  ".join(f"{name} {value:.3f}" for name, value in report.metrics.items())
     print(f"{report.steps} steps in {report.seconds:.0f} s: {figures}")
