@@ -200,7 +200,16 @@ def _print(title: str, rows: Any) -> None:
     from isp_assets.evaluate.table import cell
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = Table(*columns, title=title)
-    for row in rows:
-        table.add_row(*(cell(row.get(key)) for key in columns))
-    Console().print(table)
+    cells = [[cell(row.get(key)) for key in columns] for row in rows]
+    console, table = Console(), Table(*columns, title=title)
+    for texts in cells:
+        table.add_row(*texts)
+    unbounded = console.options.update(width=10_000)
+    needed = console.measure(table, options=unbounded).maximum
+    if needed > console.width and console.is_terminal:  # turned by a quarter, it can be read
+        table = Table(*("" for _ in range(len(cells) + 1)), title=title, show_header=False)
+        for name, *texts in zip(columns, *cells, strict=True):
+            table.add_row(name, *texts)
+    elif needed > console.width:  # a pipe has no width that lines must fit into
+        console.width = needed
+    console.print(table)
