@@ -118,7 +118,7 @@ def atlas(
     width: Annotated[int | None, typer.Option(help="Width of new atlases. [default: 128]")] = None,
     batch: Annotated[int, typer.Option(help="Garments a step; a GPU takes 96 in nearly the same time.")] = 24,
     rate: Annotated[
-        float | None, typer.Option(help="Peak learning rate. [default: .0015; with --bundle .0006]")
+        float | None, typer.Option(help="Peak learning rate. [default: .003; with --bundle .001]")
     ] = None,
 ) -> None:
     """Train the maps from the panels to the rest body: CATEGORY.safetensors, a bundle (Eqs. 3-4)."""

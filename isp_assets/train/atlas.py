@@ -35,7 +35,7 @@ from isp_assets.train.optimizers import LOOKUP, OptimizerName
 from isp_assets.train.patterns import dataset_digest
 from isp_assets.train.rehearsal import rehearse
 
-FURTHER_RATE = 6e-4
+FURTHER_RATE = 1e-3
 """Peak learning rate of atlases that are trained already."""
 
 
