@@ -31,7 +31,7 @@ class PatternOptions:
 
     code_size: int = 32
     code_spread: float = 0.01
-    """Standard deviation of the random numbers that codes start from; what is left of them at the end is noise."""
+    """Standard deviation of the random numbers that codes start from; what is left of them is noise."""
     width: int = 128
     depths: tuple[int, int, int] = (3, 6, 4)
     """Layers: shared, then of the distance branch, and of the label branch."""
