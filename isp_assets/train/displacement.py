@@ -53,7 +53,7 @@ class DisplacementOptions:
     garments: int = 2
     """Garments a step, all in the same poses."""
     learning_rate: float = 1e-3
-    optimizer: OptimizerName = "adam"
+    optimizer: OptimizerName = "soap"
 
 
 @dataclass(frozen=True, eq=False)
