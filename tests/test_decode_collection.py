@@ -10,6 +10,7 @@ import isp_assets
 from isp_assets.bundle import GarmentBundle
 from isp_assets.decode import SLIVER, cut_panels, decode_with_report, lift_points
 from isp_assets.errors import DecodeError
+from isp_assets.fit_options import CodeSpace
 from isp_assets.garment import Garment
 from isp_assets.geometry.sewing import sew_panels
 from isp_assets.geometry.topology import boundary_loops, edges
@@ -26,9 +27,9 @@ def bundle(request) -> GarmentBundle:
 
 
 def _random_codes(bundle: GarmentBundle, count: int, *, spread: float = 1.0) -> np.ndarray:
-    codes = np.stack(list(bundle.codes.values())).astype(np.float64)
-    draws = np.random.default_rng(0).normal(size=(count, codes.shape[1]))
-    return (codes.mean(axis=0) + spread * codes.std(axis=0) * draws).astype(np.float32)
+    space = CodeSpace.of(np.stack(list(bundle.codes.values())))
+    draws = np.random.default_rng(0).normal(size=(count, len(space.mean)))
+    return np.stack([space.code(spread * draw) for draw in draws]).astype(np.float32)
 
 
 def _between_codes(bundle: GarmentBundle, count: int) -> list[np.ndarray]:

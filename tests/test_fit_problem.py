@@ -158,20 +158,20 @@ def test_few_steps_do_what_many_gradients_do(bundle):
 
 
 def test_a_known_code_of_a_trained_bundle_comes_back(bundle):
-    """By rounds of cutting and descending; a start may stop short, close by: a fit has several."""
+    """By rounds of cutting and descending. Where codes hardly spread, the garment hardly tells them."""
     space = space_of(bundle)
+    spread = np.linalg.norm(space.from_white, axis=0)
     white = 0.5 * space.position(list(bundle.codes.values())[3])
     target = Target(surface(bundle, space.code(white)), samples=800)
     weights = FitWeights(prior=1e-4)
-    ends = []
     for seed in range(3):
         search = Search(bundle.model, space, target, replace(OPTIONS, weights=weights), movable=False)
         start = white + 0.3 * np.random.default_rng(seed).normal(size=len(white))
-        ends.append(search.settle(search.begin(space.code(start), "near")))
-        assert np.abs(ends[-1].position - white).max() < 0.1
-        assert ends[-1].start == "near"
+        end = search.settle(search.begin(space.code(start), "near"))
+        assert (spread * np.abs(end.position - white)).max() < 0.05 * spread.max()
+        assert end.energy < 0.1, "three tenths of a millimetre"
+        assert end.start == "near"
         assert search.evaluations < 80
-    assert sorted(end.energy for end in ends)[1] < 0.05
 
 
 def test_a_shift_is_found_only_where_the_place_is_open():
@@ -197,11 +197,15 @@ def test_a_code_that_cannot_be_cut_is_said_and_a_step_to_one_is_halved():
     with pytest.raises(DecodeError):
         FitProblem(model, space, target, OPTIONS, np.array([-2.0, 0.0]))
 
+    plain = Search(model, space, target, OPTIONS, movable=False)
+    leads = plain.round(plain.begin(np.zeros(2), "a"), 4).position[0]  # the first step
+    assert leads > 0.01
+
     class Leaping(Search):
         refused = 0
 
         def _cut(self, state):
-            if 0 < abs(state.position[0] - 0.02) < 0.005:  # where the first step leads
+            if abs(state.position[0] - leads) < 0.1 * leads:
                 self.refused += 1
                 raise DecodeError("no garment here")
             return super()._cut(state)
@@ -209,7 +213,7 @@ def test_a_code_that_cannot_be_cut_is_said_and_a_step_to_one_is_halved():
     search = Leaping(model, space, target, OPTIONS, movable=False)
     end = search.round(search.begin(np.zeros(2), "a"), 4)
     assert search.refused > 0
-    assert end.position[0] == pytest.approx(0.01, abs=3e-3), "half of the way"
+    assert end.position[0] == pytest.approx(leads / 2, rel=0.01), "half of the way"
 
 
 @pytest.mark.parametrize("change", [{"resolution": 8}, {"samples": 9}, {"finalists": 0}, {"trial_rounds": 0}])
