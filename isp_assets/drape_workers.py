@@ -16,11 +16,13 @@ from itertools import islice
 from multiprocessing import active_children, get_context
 from typing import Any
 
+import torch
+
 from isp_assets.drape import DrapeOptions, Draper, chunk_rows
 from isp_assets.errors import DrapeError
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene
 from isp_assets.outfit import Outfit
-from isp_assets.processes import end_with_parent, one_thread_each
+from isp_assets.processes import denormals_flushed, end_with_parent, one_thread_each
 from isp_assets.shot import Shot
 
 Complete = Callable[[FrameChunk, int], FrameChunk]
@@ -79,7 +81,9 @@ class _Pool:
 
     def __init__(self, payload: tuple[Any, ...], rows: Sequence[slice], workers: int) -> None:
         before = set(active_children())
-        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (pickle.dumps(payload),))
+        self._pool = ProcessPoolExecutor(
+            workers, get_context("spawn"), _start, (pickle.dumps(payload), denormals_flushed())
+        )
         self._further = iter(rows)
         with self._ended_on_error():
             with one_thread_each():  # the processes start with their first tasks
@@ -136,7 +140,8 @@ _payload = b""
 _worker: _Worker | None = None
 
 
-def _start(payload: bytes) -> None:
+def _start(payload: bytes, flush_denormals: bool) -> None:
+    torch.set_flush_denormal(flush_denormals)  # else the last bits differ from those of the first process
     global _payload
     _payload = payload
     end_with_parent()

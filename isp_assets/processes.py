@@ -45,3 +45,10 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def denormals_flushed() -> bool:
+    """Whether this process takes numbers too small for float32's full precision as zero."""
+    import torch
+
+    return float(torch.tensor([1e-38]) * 1e-3) == 0.0
