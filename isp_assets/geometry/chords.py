@@ -14,18 +14,20 @@ def split_chords(
     Such a chord, as across a narrow sleeve or a sharp corner, tends to be in both
     panels; sewn, its two copies would be one edge with four faces.
     """
-    mesh = edges(faces)
+    near = np.flatnonzero(sewn[faces].sum(axis=1) >= 2)  # no other face has such an edge
+    mesh = edges(faces[near])
     chord = (mesh.num_faces == 2) & sewn[mesh.vertices].all(axis=1)
     if not chord.any():
         return points, faces
     middle = np.full(len(mesh.vertices), -1)
     middle[chord] = len(points) + np.arange(chord.sum())
     points = np.concatenate([points, points[mesh.vertices[chord]].mean(axis=1)])
-    cut = chord[mesh.face_edge]
-    kept, parts = faces[~cut.any(axis=1)], []
-    for face, mid in zip(faces[cut.any(axis=1)], middle[mesh.face_edge[cut.any(axis=1)]], strict=True):
-        parts.append(_split_face(points, face, mid))
-    return points, np.concatenate([kept, *parts])
+    cut = chord[mesh.face_edge].any(axis=1)
+    parts = [
+        _split_face(points, face, mid)
+        for face, mid in zip(faces[near[cut]], middle[mesh.face_edge[cut]], strict=True)
+    ]
+    return points, np.concatenate([np.delete(faces, near[cut], axis=0), *parts])
 
 
 def _split_face(points: Float[np.ndarray, "P 2"], face: Int[np.ndarray, "3"], mid: Int[np.ndarray, "3"]):

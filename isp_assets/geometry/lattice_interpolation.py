@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from torch import Tensor
+from torch import Tensor, nn
 
 _STENCIL = np.arange(-1, 3)
 _REACH = np.sqrt(2)
@@ -55,24 +55,29 @@ class LatticeInterpolation:
         distance, _ = tree.query(points, distance_upper_bound=_REACH * step)
         inside = np.isinf(distance)
         rows = np.flatnonzero(inside)
-        cell, share = np.divmod(points[rows] / step, 1.0)
-        nodes = cell.astype(np.int64)[:, None, :] + _STENCIL[:, None]
-        low = nodes.reshape(-1, 2).min(0) if len(rows) else np.zeros(2, np.int64)
-        width = int(nodes[..., 0].max() - low[0]) + 1 if len(rows) else 1
-        flat = (nodes[..., 0] - low[0])[:, None, :] + width * (nodes[..., 1] - low[1])[:, :, None]
-        is_used = np.zeros(int(flat.max(initial=0)) + 1, bool)
-        is_used[flat] = True
-        used, sources = np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[flat]
-        lattice = step * (np.stack([used % width, used // width], axis=1) + low)
-        along = _cubic(share)
-        weights = along[:, 1, :, None] * along[:, 0, None, :]
+        scaled = points[rows] / step
+        cell = np.floor(scaled)
+        along = _cubic(scaled - cell)
+        low = cell.min(axis=0) if len(rows) else np.zeros(2)
+        column, row = (cell - low).astype(np.int64).T
+        num_columns, num_rows = (int(k.max(initial=-1)) + 1 for k in (column, row))
+        has_points = np.zeros((num_rows, num_columns), bool)
+        has_points[row, column] = True
+        width = num_columns + len(_STENCIL) - 1
+        is_used = np.zeros((num_rows + len(_STENCIL) - 1, width), bool)  # nodes, from one before the cells on
+        for i in range(len(_STENCIL)):
+            for j in range(len(_STENCIL)):
+                is_used[i : i + num_rows, j : j + num_columns] |= has_points
+        used_row, used_column = np.nonzero(is_used)
+        number = np.cumsum(is_used.reshape(-1)) - 1
+        stencil = (width * (_STENCIL[:, None] + 1) + _STENCIL + 1).reshape(-1)
         exact = np.flatnonzero(~inside)
         return cls(
-            places=np.concatenate([lattice, points[exact]]),
+            places=np.concatenate([step * (np.stack([used_column, used_row], 1) + low - 1), points[exact]]),
             exact=exact,
             points=rows,
-            sources=sources.reshape(len(rows), 16),
-            weights=weights.reshape(len(rows), 16),
+            sources=number[(width * row + column)[:, None] + stencil],
+            weights=(along[:, 1, :, None] * along[:, 0, None, :]).reshape(len(rows), 16),
         )
 
     def __call__(
@@ -87,7 +92,7 @@ class LatticeInterpolation:
             return result
         sources = torch.from_numpy(self.sources).to(like.device)
         weights = torch.from_numpy(self.weights).to(values)
-        mixed = torch.bmm(weights[:, None], values[sources])[:, 0]
+        mixed = nn.functional.embedding_bag(sources, values, mode="sum", per_sample_weights=weights)
         return result.index_copy(0, torch.from_numpy(self.points).to(like.device), mixed)
 
 

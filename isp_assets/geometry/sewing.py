@@ -142,7 +142,7 @@ def sew_panels(
     sewn = SewnPanels(
         {side: replace(panels[side], vertex_index=index[side]) for side in PANELS}, seams, count, spacing
     )
-    _check_surface(sewn.faces)
+    _check_surface(sewn)
     return sewn
 
 
@@ -268,7 +268,13 @@ def _seam(match: _Match, loops: Mapping[str, list[Loop]], panels: Mapping[str, F
     return FlatSeam(match.labels, *ends)
 
 
-def _check_surface(faces: Int[np.ndarray, "F 3"]) -> None:
+def _check_surface(sewn: SewnPanels) -> None:
+    """Each panel is a surface already, so only an edge between two seam vertices can have too many faces."""
+    on_seam = np.zeros(sewn.num_vertices, dtype=bool)
+    for seam in sewn.seams:
+        on_seam[sewn.panels[PANELS[0]].vertex_index[seam.front]] = True
+    faces = sewn.faces
+    faces = faces[on_seam[faces].sum(axis=1) >= 2]
     if (faces == np.roll(faces, 1, axis=1)).any():
         raise GeometryError("sewing folds a triangle onto one edge; two seams meet twice")
     count = edges(faces).num_faces

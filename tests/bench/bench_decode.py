@@ -47,9 +47,10 @@ def full_grid(model: GarmentModel, codes: dict[str, np.ndarray], resolution: int
     atlases = {side: Atlas(AtlasConfig.paper()).eval() for side in PANELS}
     axis = torch.linspace(-1, 1, resolution + 1)
     xy = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).reshape(-1, 2)
-    code = torch.from_numpy(next(iter(codes.values())))
+    own_code = torch.from_numpy(next(iter(codes.values())))
+    code = torch.randn(PanelFieldConfig.paper(model.num_labels).code_size)
     with torch.no_grad():
-        inside = {side: xy[model.panel_fields[side].signed_distance(xy, code) < 0] for side in PANELS}
+        inside = {side: xy[model.panel_fields[side].signed_distance(xy, own_code) < 0] for side in PANELS}
         began = time.perf_counter()
         for side in PANELS:
             for part in xy.split(2**16):
