@@ -272,6 +272,17 @@ def test_trained_bundle_is_written_with_its_displacements_and_figures(
     )
 
 
+def test_training_further_begins_with_contact_at_its_full_stiffness(
+    task: DisplacementTask, bundle: GarmentBundle, skin: SkinBundle, body: Body, options: DisplacementOptions
+) -> None:
+    def collision(of: DisplacementTask, progress: float) -> torch.Tensor:
+        return of.losses(torch.Generator().manual_seed(3), progress)["collision"].detach()
+
+    further = DisplacementTask(replace(bundle, drape_field=task.module), skin, body, options)
+    assert collision(further, 0.0) == collision(further, 1.0) == collision(task, 1.0)
+    assert collision(task, 0.0) < collision(task, 1.0)
+
+
 def test_unequal_bodies_are_refused(
     bundle: GarmentBundle, skin: SkinBundle, body: Body, tmp_path: Path
 ) -> None:

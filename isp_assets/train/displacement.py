@@ -96,7 +96,7 @@ class DisplacementTask:
         samples = build_wardrobe(bundle, self.body, skin_field, wardrobe, seed=seed)
         self.wardrobe = [sample.to(self.device) for sample in samples]
         self.clips = load_clips(options.poses)
-        self.module = DrapeField(config)
+        self.module, self.is_further = DrapeField(config), earlier is not None
         if earlier is not None:
             self.module.load_state_dict(earlier.state_dict())
         self.module.to(self.device)
@@ -117,7 +117,8 @@ class DisplacementTask:
         batch = self.pose(poses, betas)
         maps = self.module.maps()
         chosen = torch.randint(len(self.wardrobe), (self.options.garments,), generator=generator)
-        stiffness = self.options.contact.at(progress)
+        # What is trained further must not sink into the body first.
+        stiffness = self.options.contact.at(1.0 if self.is_further else progress)
         totals: dict[str, Tensor] = {}
         for index in chosen.tolist():
             sample = self.wardrobe[index]
@@ -210,7 +211,8 @@ def train_displacement(
     """Train D_s and write ``CATEGORY.safetensors``, the bundle with its displacement network, into ``out``.
 
     Args:
-        bundle: The category's garments. A displacement network that it already has is trained further.
+        bundle: The category's garments. A displacement network that it already has is trained further,
+            with contact at its full stiffness from the start.
         skin: The diffused skinning of the body.
         out: Folder; also takes the checkpoint and the history.
         run: Budget and device.
