@@ -39,6 +39,16 @@ _BELONGS = 0.3  # weight from which a vertex belongs to a part
 _EXTENDS = 0.08  # weight from which a face counts to a part; lower, so that parts overlap at their seams
 
 
+def body_parts(
+    joint_weights: Float[np.ndarray, "V 24"],
+) -> tuple[Bool[np.ndarray, "V 6"], Bool[np.ndarray, "V 6"]]:
+    """Which of `BODY_PARTS` each vertex belongs to, at least one; and which it may touch as its own."""
+    weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
+    parts = weight >= _BELONGS
+    parts[np.arange(len(parts)), weight.argmax(1)] = True
+    return parts, parts | (weight >= _EXTENDS)
+
+
 @dataclass(frozen=True, eq=False)
 class CollisionMesh:
     """Static collision data of a body or a garment; built once, used in every frame."""
@@ -88,11 +98,9 @@ class CollisionMesh:
         Raises:
             GeometryError: If the mesh is no surface.
         """
-        weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
-        parts = weight >= _BELONGS
-        parts[np.arange(len(parts)), weight.argmax(1)] = True
+        parts, extended = body_parts(joint_weights)
         topology = SurfaceTopology.build(faces, len(joint_weights))
-        of_face = (weight >= _EXTENDS)[topology.faces].any(1)
+        of_face = extended[topology.faces].any(1)
         return cls(topology, parts, tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS))))
 
 

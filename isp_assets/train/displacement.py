@@ -26,9 +26,11 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
+from isp_assets.geometry.obstacle import body_parts
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.networks.placement import on_device
 from isp_assets.skinning import shape_garment, skin_garment
+from isp_assets.train.body_contact import PartedBody
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
@@ -58,11 +60,11 @@ class DisplacementOptions:
 
 @dataclass(frozen=True, eq=False)
 class PosedBatch:
-    """A body shape in some poses, and its skin as an obstacle."""
+    """A body shape in some poses, and its skin as an obstacle, part by part."""
 
     betas: Float[Tensor, " B"]
     posed: PosedBody
-    surface: Surface
+    skin: PartedBody
 
 
 class DisplacementTask:
@@ -91,6 +93,7 @@ class DisplacementTask:
         self.optimizer = options.optimizer
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
+        self.body_parts = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1]).to(self.device)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)
         skin_field = on_device(skin.skin_field, self.device)
         samples = build_wardrobe(bundle, self.body, skin_field, wardrobe, seed=seed)
@@ -132,7 +135,8 @@ class DisplacementTask:
         with torch.no_grad():
             betas = betas.to(self.device)
             posed = self.body.pose(poses.to(self.device), betas=betas)
-            return PosedBatch(betas, posed, Surface.of_mesh(posed.vertices, self.body.faces))
+            skin = PartedBody.of(Surface.of_mesh(posed.vertices, self.body.faces), self.body_parts)
+            return PosedBatch(betas, posed, skin)
 
     def drape(
         self, sample: WornSample, batch: PosedBatch, *, maps: tuple[Tensor, Tensor]
@@ -156,14 +160,15 @@ class DisplacementTask:
         """What measuring a garment in some poses needs besides its positions."""
         shaped = shape_garment(sample.bound, batch.betas)
         rest = graded_rest(sample.rest, sample.bound.canonical, shaped)
-        return DrapeCase(rest, self.fabric, batch.surface, self.options.contact)
+        return DrapeCase(rest, self.fabric, batch.skin.whole, self.options.contact)
 
     def _scaled(
         self, sample: WornSample, skinned: Tensor, vertices: Tensor, batch: PosedBatch, stiffness: float
     ) -> dict[str, Tensor]:
         case = self.case(sample, batch)
+        height = batch.skin.clearance(vertices, sample.parts, margin=case.contact.margin)
         terms = drape_energies(
-            vertices, case.rest, self.fabric, batch.surface, case.contact, stiffness=stiffness
+            vertices, case.rest, self.fabric, case.body, case.contact, stiffness=stiffness, height=height
         )
         reference = reference_energy(case.rest)
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")

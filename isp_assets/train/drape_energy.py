@@ -44,10 +44,13 @@ class Contact:
 
 def drape_energies(
     vertices: Float[Tensor, "T V 3"], rest: ClothRest, fabric: Fabric, body: Surface, contact: Contact,
-    *, stiffness: float,
+    *, stiffness: float, height: Float[Tensor, "T V"] | None = None,
 ) -> dict[str, Float[Tensor, " T"]]:  # fmt: skip
-    """The terms of Eq. 8 [J]: strain, bending, gravity, collision."""
-    lacking = torch.relu(contact.margin - clearance(vertices, body))
+    """The terms of Eq. 8 [J]: strain, bending, gravity, collision.
+
+    ``height`` [m], if given, stands for the clearance of the vertices; see `body_contact.PartedBody`.
+    """
+    lacking = torch.relu(contact.margin - (clearance(vertices, body) if height is None else height))
     near = lacking.clamp_max(contact.depth)
     penalty = contact.cubic * near.pow(3) + 0.5 * stiffness * rest.mass * near.square()
     slope = 3 * contact.cubic * contact.depth**2 + stiffness * rest.mass * contact.depth

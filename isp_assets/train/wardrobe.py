@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from isp_assets.body import Body
@@ -16,6 +16,7 @@ from isp_assets.errors import DecodeError, GeometryError, TrainError
 from isp_assets.garment import Garment
 from isp_assets.geometry.energy import ClothRest, Fabric, cloth_rest
 from isp_assets.geometry.grading import face_strain
+from isp_assets.geometry.obstacle import body_parts
 from isp_assets.geometry.panel_map import PanelSampler
 from isp_assets.networks.skin_field import SkinField
 from isp_assets.skinning import BoundGarment, bind
@@ -35,6 +36,8 @@ class WornSample:
     ramp: Float[Tensor, "V 1"]
     """Factor on displacements; 0 where the body holds the garment."""
     rest: ClothRest
+    parts: Bool[Tensor, "V 6"]
+    """Which of `BODY_PARTS` each vertex belongs to."""
 
     def to(self, device: torch.device | str) -> "WornSample":
         """A copy on another device."""
@@ -45,6 +48,7 @@ class WornSample:
             self.sampler.to(device),
             self.ramp.to(device),
             self.rest.to(device),
+            self.parts.to(device),
         )
 
 
@@ -68,13 +72,15 @@ def make_sample(
         GeometryError: If the garment's panels are degenerate.
     """
     rest = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, fabric)
+    bound = bind(garment, body, skin)
     return WornSample(
         garment=garment,
         code=torch.as_tensor(garment.code, dtype=torch.float32),
-        bound=bind(garment, body, skin),
+        bound=bound,
         sampler=panel_sampler(garment, bundle.model, resolution=map_size),
         ramp=torch.from_numpy(anchor_ramp(garment))[:, None],
         rest=rest.to(dtype=torch.float32),
+        parts=torch.from_numpy(body_parts(bound.joint_weights.cpu().numpy())[0]),
     )
 
 
