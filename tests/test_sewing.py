@@ -5,8 +5,9 @@ import pytest
 from analytic_panels import JACKET_FRONT, SHIRT, SHIRT_SEAMS, SKIRT, SKIRT_SEAMS
 
 from isp_assets.errors import GeometryError
+from isp_assets.geometry import sewing
 from isp_assets.geometry.edge_runs import EdgeRun
-from isp_assets.geometry.sewing import SewnPanels, sew_panels
+from isp_assets.geometry.sewing import FlatPanel, FlatSeam, SewnPanels, sew_panels
 from isp_assets.geometry.topology import boundary_loops, edges
 
 
@@ -47,6 +48,27 @@ def _check_surface(sewn: SewnPanels, num_loops: int) -> None:
         a, b, c = (panel.points[panel.faces[:, k]] for k in range(3))
         area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
         assert (sign * area > 0).all()
+
+
+def test_a_corner_that_joins_two_points_of_one_panel_is_refused_where_they_have_a_common_neighbour():
+    """Edges to that neighbour become one edge with four faces, though its other end is on no seam."""
+    angle = 2 * np.pi * np.arange(4) / 4
+    wheel = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], axis=1), np.zeros((1, 2))])
+    spokes = np.array([[4, 1, 0], [4, 2, 1], [4, 3, 2], [4, 0, 3]])
+    label = np.array([1, 1, 1, 1, 0])
+
+    def sewn(joined: int) -> SewnPanels:
+        """The front's first point sewn to the back's point 0, and to another."""
+        vertex = np.array([0, 3, 4, 5, 6])
+        vertex[joined] = 0
+        front = FlatPanel(wheel[:3], np.array([[0, 1, 2]]), np.arange(3), label[:3], ())
+        back = FlatPanel(wheel, spokes, vertex, label, ())
+        seams = [FlatSeam((1, 1), np.array([0]), np.array([k])) for k in sorted({0, joined})]
+        return SewnPanels({"front": front, "back": back}, tuple(seams), 7, 1.0)
+
+    sewing._check_surface(sewn(0))
+    with pytest.raises(GeometryError, match="no surface: 1 edges"):
+        sewing._check_surface(sewn(2))
 
 
 @pytest.mark.parametrize("spacing", [0.2, 0.07, 0.031])

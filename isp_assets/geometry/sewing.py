@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from isp_assets.conventions import PANELS
@@ -269,12 +269,13 @@ def _seam(match: _Match, loops: Mapping[str, list[Loop]], panels: Mapping[str, F
 
 
 def _check_surface(sewn: SewnPanels) -> None:
-    """Each panel is a surface already, so only an edge between two seam vertices can have too many faces."""
-    on_seam = np.zeros(sewn.num_vertices, dtype=bool)
-    for seam in sewn.seams:
-        on_seam[sewn.panels[PANELS[0]].vertex_index[seam.front]] = True
+    """Each panel is a surface already: an edge with too many faces runs between two vertices that both panels
+    have, or from one that joins several points of a panel."""
+    count = np.stack([np.bincount(p.vertex_index, minlength=sewn.num_vertices) for p in sewn.panels.values()])
+    shared: Bool[np.ndarray, " V"] = np.asarray((count > 0).all(axis=0))
+    joined: Bool[np.ndarray, " V"] = np.asarray((count > 1).any(axis=0))
     faces = sewn.faces
-    faces = faces[on_seam[faces].sum(axis=1) >= 2]
+    faces = faces[(shared[faces].sum(axis=1) >= 2) | joined[faces].any(axis=1)]
     if (faces == np.roll(faces, 1, axis=1)).any():
         raise GeometryError("sewing folds a triangle onto one edge; two seams meet twice")
     count = edges(faces).num_faces
