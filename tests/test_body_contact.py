@@ -55,10 +55,13 @@ def test_cloth_of_both_parts_is_pushed_as_by_a_whole_body() -> None:
         assert _height_and_slope(x, BOTH)[0] == pytest.approx(whole)
 
 
-def test_without_room_only_the_own_part_counts() -> None:
-    height, slope = _height_and_slope(-0.002, ARM)  # in the torso, and 52 mm off the arm: there is room
+def test_a_sleeve_in_the_torso_is_pulled_to_its_arm() -> None:
+    height, slope = _height_and_slope(-0.002, ARM)
     assert height == pytest.approx(-0.002)
     assert slope == pytest.approx([1, 0, 0])
+
+
+def test_without_room_only_the_own_part_counts() -> None:
     points = torch.zeros(1, 2, 3, dtype=torch.float64)
     points[0, 1, 0] = 0.003  # a skin against this one, 3 mm off
     normals = torch.tensor([[[1.0, 0, 0], [-1.0, 0, 0]]], dtype=torch.float64)

@@ -13,7 +13,7 @@ from isp_assets.body import Body
 from isp_assets.bundle import GarmentBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.garment import Garment
-from isp_assets.geometry.contact import Surface
+from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.energy import ClothRest, Fabric, cloth_rest, membrane_energy
 from isp_assets.geometry.grading import face_strain, graded_rest
 from isp_assets.geometry.rotations import axis_angle_to_matrix
@@ -79,11 +79,12 @@ def test_collision_counts_only_what_is_too_near() -> None:
     rest = _rest()
     far = Surface(torch.full((1, 1, 3), -9.0).double(), torch.tensor([[[1.0, 0, 0]]]).double())
     x, contact = _positions()[None], Contact()
-    terms = drape_energies(x, rest, Fabric(), far, contact, stiffness=1e4)
+    terms = drape_energies(x, clearance(x, far), rest, Fabric(), contact, stiffness=1e4)
     assert float(terms["collision"]) == 0
     assert torch.equal(terms["strain"], membrane_energy(x, rest, Fabric()))
     plane = Surface(x.mean(1, keepdim=True), torch.tensor([[[1.0, 0, 0]]]).double())
-    assert float(drape_energies(x, rest, Fabric(), plane, contact, stiffness=1e4)["collision"]) > 0
+    near = drape_energies(x, clearance(x, plane), rest, Fabric(), contact, stiffness=1e4)
+    assert float(near["collision"]) > 0
 
 
 def test_collision_penalty_is_smooth_where_it_turns_linear() -> None:
@@ -93,7 +94,8 @@ def test_collision_penalty_is_smooth_where_it_turns_linear() -> None:
 
     def penalty(depth: float) -> float:
         moved = x - torch.tensor([0.0, depth - contact.margin, 0], dtype=torch.float64)
-        return float(drape_energies(moved, rest, Fabric(), plane, contact, stiffness=1e4)["collision"])
+        height = clearance(moved, plane)
+        return float(drape_energies(moved, height, rest, Fabric(), contact, stiffness=1e4)["collision"])
 
     turn, h = contact.depth, 1e-5
     below, above = penalty(turn) - penalty(turn - h), penalty(turn + h) - penalty(turn)

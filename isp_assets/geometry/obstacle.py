@@ -46,7 +46,7 @@ def body_parts(
     weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
     parts = weight >= _BELONGS
     parts[np.arange(len(parts)), weight.argmax(1)] = True
-    return parts, parts | (weight >= _EXTENDS)
+    return parts, weight >= _EXTENDS
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,9 +167,7 @@ class DisplacementTask:
     ) -> dict[str, Tensor]:
         case = self.case(sample, batch)
         height = batch.skin.clearance(vertices, sample.parts, margin=case.contact.margin)
-        terms = drape_energies(
-            vertices, case.rest, self.fabric, case.body, case.contact, stiffness=stiffness, height=height
-        )
+        terms = drape_energies(vertices, height, case.rest, self.fabric, case.contact, stiffness=stiffness)
         reference = reference_energy(case.rest)
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")
         # The gradient is that of the energy's square root where the energy is large.

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.conventions import GRAVITY
-from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.energy import ClothRest, Fabric, bending_energy, gravity_energy, membrane_energy
 
 _REFERENCE_LIFT = 0.05  # energies are compared with that of lifting the garment this far [m]
@@ -43,14 +42,14 @@ class Contact:
 
 
 def drape_energies(
-    vertices: Float[Tensor, "T V 3"], rest: ClothRest, fabric: Fabric, body: Surface, contact: Contact,
-    *, stiffness: float, height: Float[Tensor, "T V"] | None = None,
+    vertices: Float[Tensor, "T V 3"], height: Float[Tensor, "T V"], rest: ClothRest, fabric: Fabric,
+    contact: Contact, *, stiffness: float,
 ) -> dict[str, Float[Tensor, " T"]]:  # fmt: skip
     """The terms of Eq. 8 [J]: strain, bending, gravity, collision.
 
-    ``height`` [m], if given, stands for the clearance of the vertices; see `body_contact.PartedBody`.
+    ``height`` is the clearance of the vertices over the body [m], plain or that of a `PartedBody`.
     """
-    lacking = torch.relu(contact.margin - (clearance(vertices, body) if height is None else height))
+    lacking = torch.relu(contact.margin - height)
     near = lacking.clamp_max(contact.depth)
     penalty = contact.cubic * near.pow(3) + 0.5 * stiffness * rest.mass * near.square()
     slope = 3 * contact.cubic * contact.depth**2 + stiffness * rest.mass * contact.depth

@@ -31,8 +31,9 @@ class DrapeCase:
 
     def energies(self, vertices: Float[Tensor, "T V 3"]) -> dict[str, Float[Tensor, " T"]]:
         """The terms of Eq. 8 [J] at the stiffness of the end of training."""
+        height = clearance(vertices, self.body)
         return drape_energies(
-            vertices, self.rest, self.fabric, self.body, self.contact, stiffness=self.contact.stiffness
+            vertices, height, self.rest, self.fabric, self.contact, stiffness=self.contact.stiffness
         )
 
     def frame(self, index: int) -> "DrapeCase":

@@ -22,7 +22,7 @@ from isp_assets.body import Body, PosedBody
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
-from isp_assets.geometry.energy import Fabric
+from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
 from isp_assets.geometry.obstacle import Obstacle
 from isp_assets.geometry.tuck import tuck
@@ -154,11 +154,8 @@ class LayeringTask:
         options, contact = self.options, self.options.contact
         bound = stack.wearer.bound
         rest = graded_rest(stack.wearer.rest, bound.canonical, shape_garment(bound, stack.betas))
-        terms = drape_energies(vertices, rest, self.fabric, stack.beneath[0], contact, stiffness=stiffness)
-        with torch.no_grad():
-            before = drape_energies(
-                stack.draped, rest, self.fabric, stack.beneath[0], contact, stiffness=stiffness
-            )
+        height = clearance(vertices, stack.beneath[0])
+        terms = drape_energies(vertices, height, rest, self.fabric, contact, stiffness=stiffness)
         layers = vertices.new_zeros(len(vertices))
         for surface in stack.beneath[1:]:
             lacking = torch.relu(contact.margin - clearance(vertices, surface))
@@ -169,7 +166,7 @@ class LayeringTask:
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")
         # The gradient is that of the energy's square root where the energy is large.
         weight = (reference * (reference + present)).rsqrt()
-        terms["gravity"] = terms["gravity"] - before["gravity"]
+        terms["gravity"] = terms["gravity"] - gravity_energy(stack.draped, rest)
         scaled = {name: (weight * value).mean() for name, value in terms.items()}
         moved = (vertices - stack.draped) / options.network.displacement_scale
         scaled["regular"] = options.regular_weight * moved.square().sum(-1).mean()

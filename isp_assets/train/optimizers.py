@@ -1,8 +1,8 @@
 """Optimizers of the training loop, and their state as plain tensors for a checkpoint.
 
 SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) is Adam in
-the eigenbasis of each weight matrix's gradients. A step of the
-atlases takes a fifth more time than Adam's, and far fewer reach the same loss.
+the eigenbasis of each weight matrix's gradients. A step of the atlases takes a fifth more
+time than Adam's, and far fewer reach the same loss.
 """
 
 from collections.abc import Mapping
