@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, tube, weights
+from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, sheet, tube, weights
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, mean_edge
+from isp_assets.geometry.obstacle import BODY_PARTS, NO_ROOM, CollisionMesh, Obstacle, mean_edge
 
 PARTS = list(BODY_PARTS)
 
@@ -71,8 +71,24 @@ def test_room_is_missing_only_where_surfaces_press_together() -> None:
     gap = np.linalg.norm(vertices * [0, 1, 1], axis=1) + 10 * (np.abs(vertices[:, 0]) > 0.05)
     assert tight[gap < 0.005].all()
     assert not tight[gap > 0.06].any()
-    given = np.zeros(len(vertices), bool)
-    assert Obstacle(collision(shape), vertices, margin=0.003, tight=given).tight is given
+    given = gap > 9
+    named = Obstacle(collision(shape), vertices, margin=0.003, tight=given).tight
+    assert np.array_equal(named, tight | given)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.001, 0.003])
+@pytest.mark.parametrize("gap", [0.001, 0.004, 0.007, 0.03])
+def test_room_is_the_gap_and_margins_shrink_with_it(margin: float, gap: float) -> None:
+    """Two sheets that face each other: the lower one sees how far away the upper one is."""
+    (low, faces), (high, _) = sheet(11), sheet(11, height=gap)
+    vertices = np.concatenate([low, high])
+    both = obstacle((vertices, np.concatenate([faces, faces[:, ::-1] + len(low)])), margin=margin)
+    seen = 2 * max(2 * margin, NO_ROOM)
+    np.testing.assert_allclose(both.room, min(gap, seen), atol=1e-9)
+    assert both.tight.all() == (gap < NO_ROOM)
+    np.testing.assert_allclose(both.margins, min(margin, max(min(0.0005, margin), gap / 4)), atol=1e-9)
+    found = both.whole(np.array([[0.001, -0.002, 0.003]]))
+    np.testing.assert_allclose(both.margin_at(found), both.margins[:1], atol=1e-9)
 
 
 def test_mean_edge_and_refusals() -> None:

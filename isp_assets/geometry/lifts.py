@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from isp_assets.geometry.closest import Closest, unit_face_normals
+from isp_assets.geometry.narrow import narrowness
 from isp_assets.geometry.obstacle import Obstacle
 
 AROUND = 0.015
@@ -54,6 +55,8 @@ class Neighbour:
         self.faces = np.flatnonzero(any_corner(close, topology.faces))
         beneath = any_corner(obstacle.tight, topology.faces)[found.face]
         self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
+        self.narrow = narrowness(obstacle, found)
+        """How little room each vertex has over it, 0 to 1."""
 
 
 def open_beneath(
@@ -70,7 +73,9 @@ def open_beneath(
     tight = any_corner(obstacle.tight, obstacle.mesh.topology.faces)[found.face[index]]
     index = index[inner & ~tight]
     result = open_parts.copy()
-    result[index] &= ~obstacle.parts_at(found.face[index])
+    under = obstacle.parts_at(found.face[index])
+    # Where two parts meet, as at an armhole, cloth above one side may lie beneath the other.
+    result[index] &= ~(under & (under.sum(1, keepdims=True) == 1))
     return result
 
 

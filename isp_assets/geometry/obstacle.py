@@ -35,7 +35,11 @@ BODY_PARTS: dict[str, tuple[int, ...]] = {
 }
 """Joints of each part."""
 
+NO_ROOM = 0.005
+"""Surfaces this near to one another [m] leave no room for cloth between them."""
+
 _BELONGS = 0.3  # weight from which a vertex belongs to a part
+_LEAST_MARGIN = 0.0005  # clearance kept where surfaces touch [m]
 _EXTENDS = 0.08  # weight from which a face counts to a part; lower, so that parts overlap at their seams
 
 
@@ -121,15 +125,14 @@ class Obstacle:
             mesh: Its collision data.
             vertices: Its positions in this frame [m].
             margin: Clearance that others keep above it [m].
-            tight: Vertices above which there is no room for cloth; by default found by probing.
+            tight: Vertices above which there is no room for cloth, besides those that probing finds.
 
         Raises:
             GeometryError: If the margin is negative.
         """
         if margin < 0:
             raise GeometryError(f"margin must be >= 0 m, got {margin:g}")
-        if tight is not None:
-            self.tight = tight
+        self._tight = tight
         self.mesh = mesh
         self.vertices = np.ascontiguousarray(vertices, np.float64)
         self.margin = margin
@@ -145,14 +148,29 @@ class Obstacle:
         return ClosestQuery(self.vertices, self.mesh.topology, normals=self.normals)
 
     @cached_property
+    def room(self) -> Float[np.ndarray, " V"]:
+        """How far above each vertex another place of the surface lies [m]; 1 cm or four margins at most."""
+        half = max(2 * self.margin, NO_ROOM)
+        probe = self.whole(self.vertices + half * self.normals.of_vertices)
+        room = (half + probe.height).clip(0)
+        return room if self._tight is None else np.where(self._tight, 0.0, room)
+
+    @cached_property
     def tight(self) -> Bool[np.ndarray, " V"]:
         """Vertices above which there is no room for cloth: a deep crease, or the body touches itself.
 
-        A probe twice the margin above the vertex comes nearer to another place of the surface.
         Nothing can lie there without cutting the surface, so it is neither lifted hard nor blamed.
         """
-        probe = self.whole(self.vertices + 2 * self.margin * self.normals.of_vertices)
-        return probe.height < 0.6 * self.margin
+        return self.room < NO_ROOM
+
+    @cached_property
+    def margins(self) -> Float[np.ndarray, " V"]:
+        """Clearance to keep above each vertex [m]: the margin, or a quarter of the room if that is less."""
+        return (self.room / 4).clip(min(_LEAST_MARGIN, self.margin), self.margin)
+
+    def margin_at(self, found: Closest) -> Float[np.ndarray, " P"]:
+        """Clearance to keep over closest points [m]."""
+        return np.einsum("pk,pk->p", self.margins[self.mesh.topology.faces[found.face]], found.weights)
 
     @cached_property
     def mean_edge(self) -> float:

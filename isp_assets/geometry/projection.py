@@ -5,9 +5,9 @@ beneath, and the corners of garment triangles are lifted over vertices that poke
 through them. Each lift is spread over the neighbourhood and what it stretched is eased,
 so that no spike stands out; the last rounds lift without spreading, down to the pairs
 of triangles that an exact test still finds crossing. Cloth between two body parts (an
-arm and the torso) is drawn in towards its own part. Where there is no room, margins are
-given up, the order of the layers last of all. Only vertices that came near something
-are looked at again.
+arm and the torso) is drawn in towards its own part. Where there is little room, margins
+shrink with it and folds are smoothed; the order of the layers is given up last of all.
+Only vertices that came near something are looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.
@@ -33,6 +33,7 @@ from isp_assets.geometry.lifts import (
     over_planes,
     shortest_way,
 )
+from isp_assets.geometry.narrow import flatten
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.other_parts import Ways, leave_other_parts
 from isp_assets.geometry.spread import keep_larger, spread
@@ -43,7 +44,6 @@ BODY_MARGIN = 0.003
 LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
-_CRAMPED_MARGIN = 0.0005  # clearance sought there [m]
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
@@ -152,6 +152,7 @@ class _Projector:
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
         self.tight: Bool[np.ndarray, " V"] = np.any([n.cramped for n in self.near], axis=0)
+        self.narrow: Float[np.ndarray, " V"] = np.max([n.narrow for n in self.near], axis=0)
         self.pressed = np.zeros(len(position), bool)
         """Vertices between two body parts: what lifts them off one drives them into the other."""
 
@@ -169,7 +170,10 @@ class _Projector:
             rings = 0 if last else options.spread
             step = spread(lift, self.mesh.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
             self._move(step)
-            if self.stretch is not None and not last:
+            if last:
+                break
+            self._move(flatten(self.position, self.mesh, np.maximum(self.narrow, self.pressed)))
+            if self.stretch is not None:
                 self._move(self.stretch.ease(self.position, steps=options.ease - 1) - self.position)
         return options.rounds
 
@@ -187,7 +191,7 @@ class _Projector:
             index, found = self._own_contacts(neighbour)
             margin, reach = np.full(len(index), CLEAR), np.full(len(index), _ORDER_REACH)
             keep_larger(lift, shortest_way(self.position[index], found, margin, reach), index)
-        poke = self._lift_triangles(self.position + lift, layers, cramped=True)
+        poke = self._lift_triangles(self.position + lift, layers, gap=CLEAR)
         self._move(np.where((lift != 0).any(1, keepdims=True), lift, poke))
 
     def finish(self) -> int:
@@ -225,10 +229,10 @@ class _Projector:
         room = np.full(len(self.position), np.inf)
         for neighbour in self.near:
             obstacle, (index, found) = neighbour.obstacle, self._own_contacts(neighbour)
-            margin = np.where(self.tight[index], _CRAMPED_MARGIN, obstacle.margin)
+            margin = obstacle.margin_at(found)
             reach = np.where(obstacle.border_rings_at(found) < _RIM, _RIM_REACH, self.options.reach)
             keep_larger(own, shortest_way(self.position[index], found, margin, reach), index)
-            spare = np.where(found.on_border, np.inf, (found.height - obstacle.margin).clip(0))
+            spare = np.where(found.on_border, np.inf, (found.height - margin).clip(0))
             room[index] = np.minimum(room[index], spare)
         if not foreign:
             return own
@@ -246,34 +250,32 @@ class _Projector:
         return index, neighbour.obstacle.contacts(points, own, within=ASIDE)
 
     def _lift_triangles(
-        self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, cramped: bool = False
+        self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, gap: float | None = None
     ) -> Float[np.ndarray, "V 3"]:
         """Lift the corners of triangles over obstacle vertices that poke through them.
 
         Args:
             position: The garment [m].
             near: The obstacles.
-            cramped: Lift where there is no room as well, and only just clear.
+            gap: How far to lift over them [m]; by default half of the obstacle's margins.
         """
         lift = np.zeros_like(position)
         if not any(len(neighbour.faces) for neighbour in near):
             return lift
         query, faces = ClosestQuery(position, self.mesh.topology), self.mesh.topology.faces
         for neighbour in near:
-            obstacle = neighbour.obstacle
-            index = neighbour.vertices if cramped else neighbour.vertices[~obstacle.tight[neighbour.vertices]]
+            obstacle, index = neighbour.obstacle, neighbour.vertices
             found = query(obstacle.vertices[index])
             # Vertices keep the whole margin; half of it allows for their chords.
-            gap = CLEAR if cramped else obstacle.margin / 2
+            above = obstacle.margins[index] / 2 if gap is None else np.full(len(index), gap)
             facing = np.einsum("pc,pc->p", obstacle.normals.of_vertices[index], found.normal)
-            poking = (found.height > -gap) & (found.height < self.options.poke_reach) & ~found.on_border
+            poking = (found.height > -above) & (found.height < self.options.poke_reach) & ~found.on_border
             hit = np.flatnonzero(poking & (facing > SAME_SIDE))
             corner = faces[found.face[hit]]
             own = (self.mesh.parts[corner].any(1) & obstacle.mesh.parts[index[hit]]).any(1)
-            free = own & (cramped | ~self.tight[corner].any(1))
-            hit, corner, weights = hit[free], corner[free], found.weights[hit[free]]
+            hit, corner, weights = hit[own], corner[own], found.weights[hit[own]]
             share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
-            size = (found.height[hit] + gap)[:, None] * share
+            size = (found.height[hit] + above[hit])[:, None] * share
             push = size.clip(0, _POKE_STEP)[..., None] * found.normal[hit][:, None]
             keep_larger(lift, largest_per_vertex(corner, push, len(position)))
         return lift

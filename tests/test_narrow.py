@@ -1,0 +1,95 @@
+"""Little room: how little is seen, and that smoothing flattens what lies there and nothing else."""
+
+import numpy as np
+import pytest
+from collision_shapes import collision, obstacle, sheet
+
+from isp_assets.geometry.intersection import Beneath, measure_intersection
+from isp_assets.geometry.lifts import open_beneath
+from isp_assets.geometry.narrow import flatten, narrowness
+from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle
+from isp_assets.geometry.projection import project
+
+TORSO, LEFT_ARM = 0, 2  # in the order of the body's parts
+
+
+def _gap(width: float) -> Obstacle:
+    """Two sheets that face each other, as one surface."""
+    (low, faces), (high, _) = sheet(11), sheet(11, height=width)
+    return obstacle((np.concatenate([low, high]), np.concatenate([faces, faces[:, ::-1] + len(low)])))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "expected"),
+    [
+        (0.001, 0.0003, 1.0), (NO_ROOM, 0.001, 1.0), (0.0065, 0.001, 0.5), (0.009, 0.001, 0.0),
+        (0.001, -0.015, 0.5), (0.001, -0.03, 0.0),
+    ],
+)  # fmt: skip
+def test_narrowness_follows_the_gap_and_the_distance_from_it(
+    width: float, height: float, expected: float
+) -> None:
+    beneath = _gap(width)
+    found = beneath.whole(np.array([[0.001, height, 0.002]]))
+    np.testing.assert_allclose(narrowness(beneath, found), expected, atol=1e-6)
+
+
+def _folded(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    cloth, faces = sheet(21)
+    return cloth + 0.003 * np.random.default_rng(seed).normal(size=cloth.shape), faces
+
+
+def test_smoothing_is_confined_to_a_few_rings_around_what_has_no_room() -> None:
+    cloth, faces = _folded()
+    assert not flatten(cloth, collision((cloth, faces)), np.zeros(len(cloth))).any()
+    share = np.zeros(len(cloth))
+    middle = np.linalg.norm(cloth[:, [0, 2]], axis=1).argmin()
+    share[middle] = 1.0
+    moves = flatten(cloth, collision((cloth, faces)), share)
+    edge = np.linalg.norm(cloth[faces[0, 0]] - cloth[faces[0, 1]])
+    away = np.linalg.norm(cloth - cloth[middle], axis=1)
+    assert share.sum() == 1.0  # not written to
+    assert moves[away < 0.5 * edge].any()
+    assert not moves[away > 8 * edge].any()
+
+
+def test_smoothing_turns_with_the_cloth_and_takes_roughness_out_of_it() -> None:
+    cloth, faces = _folded()
+    mesh, share = collision((cloth, faces)), np.ones(len(cloth))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    moves = flatten(cloth, mesh, share)
+    np.testing.assert_allclose(flatten(cloth @ turn + 1.0, mesh, share), moves @ turn, atol=1e-12)
+
+    def roughness(points: np.ndarray) -> float:
+        inner = ~mesh.topology.border_vertex
+        return float(np.square((mesh.neighbour_average @ points - points)[inner, 1]).mean())
+
+    assert roughness(cloth + moves) < 0.5 * roughness(cloth)
+
+
+def test_folded_cloth_in_a_gap_comes_to_lie_in_it() -> None:
+    """Cloth crumpled by more than a gap of 4 mm allows ends up between its two sides."""
+    sheet_below, cloth = _gap(0.004), sheet(21, height=0.002)
+    cloth[0][:, 1] += 0.003 * np.random.default_rng(0).uniform(-1, 1, len(cloth[0]))
+    sides = Beneath(sheet_below.vertices, sheet_below.mesh.topology, closed=False)
+    before = measure_intersection(*cloth, sides).area_percent
+    done = project(cloth[0], collision(cloth), [sheet_below])
+    after = measure_intersection(done.vertices, cloth[1], sides).area_percent
+    assert before > 10
+    assert after < 0.1 * before
+
+
+def test_a_layer_covers_a_part_only_where_it_belongs_to_that_part_alone() -> None:
+    """At an armhole, cloth above the side of a vest may still lie beneath the sleeve of a shirt."""
+    vertices, faces = sheet(21)
+    mesh = collision((vertices, faces))
+    parts = np.zeros_like(mesh.parts)
+    parts[:, TORSO] = True
+    parts[vertices[:, 0] > 0, LEFT_ARM] = True
+    vest = Obstacle(CollisionMesh(mesh.topology, parts, mesh.part_faces), vertices, margin=0.0025)
+    points = np.array([[-0.05, 0.004, 0.0], [0.05, 0.004, 0.0]])
+    wanted = np.zeros((2, 6), bool)
+    wanted[:, [TORSO, LEFT_ARM]] = True
+    left = open_beneath(wanted, vest, vest.whole(points))
+    assert left[0].nonzero()[0].tolist() == [LEFT_ARM]
+    assert left[1].nonzero()[0].tolist() == [TORSO, LEFT_ARM]
