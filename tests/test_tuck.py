@@ -69,3 +69,19 @@ def test_hidden_cloth_is_pressed_in_to_where_its_cover_lies() -> None:
     np.testing.assert_allclose(pressed[shirt[0][:, 1] > 0.01], 0.12, atol=1e-9)
     nothing = Hidden(np.zeros(len(shirt[0])), hidden.height)
     assert press(shirt[0], collision(shirt), nothing, body) is shirt[0]
+
+
+def test_hidden_cloth_loses_its_crumples_and_the_rest_keeps_its_folds() -> None:
+    body, trousers = obstacle(tube(0.09, low=-0.5, high=0.5)), tube(0.1, low=-0.4, high=0.0)
+    shirt = tube(0.12, low=-0.3, high=0.3)
+    mesh = collision(shirt)
+    hidden = Hidden.at_rest(shirt[0], mesh, [obstacle(trousers)], body)
+    crumpled = shirt[0] + [0, 0.012, 0] * np.random.default_rng(0).normal(size=(len(shirt[0]), 1))
+    pressed = press(crumpled, mesh, hidden, body)
+
+    def roughness(points: np.ndarray) -> float:
+        inner = (hidden.share > 0.99) & ~mesh.topology.border_vertex
+        return float(np.abs(mesh.neighbour_average @ points - points)[inner, 1].mean())
+
+    assert roughness(pressed) < 0.4 * roughness(crumpled)
+    assert np.array_equal(pressed[hidden.share == 0], crumpled[hidden.share == 0])

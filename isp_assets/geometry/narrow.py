@@ -14,7 +14,7 @@ from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
 _STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes
-_RINGS, _DECAY = 3, 0.8  # rings of faces that are smoothed too, and how much less with every one
+_DECAY = 0.8  # how much of the smoothing is left with every ring of faces
 
 
 def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
@@ -32,18 +32,23 @@ def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
 
 
 def flatten(
-    position: Float[np.ndarray, "V 3"], mesh: CollisionMesh, share: Float[np.ndarray, " V"]
+    position: Float[np.ndarray, "V 3"],
+    mesh: CollisionMesh,
+    share: Float[np.ndarray, " V"],
+    *,
+    rings: int = 3,
 ) -> Float[np.ndarray, "V 3"]:
-    """Moves that smooth cloth [m], fading out around it.
+    """Moves that smooth cloth [m].
 
     Args:
         position: The garment [m].
         mesh: Its collision data.
         share: How far each vertex is to be smoothed, 0 to 1.
+        rings: Rings of faces around it that are smoothed too, less with every one.
     """
     if not share.any():
         return np.zeros_like(position)
     faces, share = mesh.topology.faces, share.copy()
-    for _ in range(_RINGS):
+    for _ in range(rings):
         np.maximum.at(share, faces.reshape(-1), np.repeat(_DECAY * share[faces].max(axis=1), 3))
     return _STEP * share[:, None] * (mesh.neighbour_average @ position - position)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, SurfaceNormals
+from isp_assets.geometry.narrow import flatten
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.spread import keep_larger, spread
 
@@ -29,6 +30,7 @@ _RINGS, _DECAY = 24, 0.98  # rings of neighbours that follow, and how much of it
 _BORDER_RINGS = 2.0  # edges from a cover's border at which its pull is firm
 _SURE = (0.3, 0.7)  # cosines between which a pull becomes firm
 _OVER_BODY = 0.004  # least height over the body [m] to which hidden cloth is pressed
+_SMOOTHINGS = 3  # that take out of hidden cloth what it crumpled
 _EASY = 0.01  # cloth further than this [m] beneath its cover at rest needs no pressing
 
 
@@ -121,7 +123,7 @@ class Hidden:
 def press(
     vertices: Float[np.ndarray, "V 3"], mesh: CollisionMesh, hidden: Hidden, body: Obstacle
 ) -> Float[np.ndarray, "V 3"]:
-    """Draw hidden cloth in to where its cover lies at rest.
+    """Draw hidden cloth in to where its cover lies at rest, and smooth it.
 
     Args:
         vertices: The garment in this frame [m].
@@ -141,6 +143,8 @@ def press(
     way = hidden.share[index] * (1 - hidden.height[index] / np.where(above, found.height, 1.0))
     result = vertices.copy()
     result[index] += np.where(above[:, None], way[:, None] * (found.point - points), 0.0)
+    for _ in range(_SMOOTHINGS):
+        result += flatten(result, mesh, hidden.share, rings=0)
     return result
 
 
