@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from isp_assets.geometry.closest import Closest
-from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle
+from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle, mean_edge
 
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
-_STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes
-_DECAY = 0.8  # how much of the smoothing is left with every ring of faces
+_STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes at once
+_FOLD = 0.018  # about the size of the folds that are smoothed [m], whatever the size of the triangles
+_MOST_RINGS, _MOST_STEPS = 16, 9
 
 
 def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
@@ -36,7 +37,7 @@ def flatten(
     mesh: CollisionMesh,
     share: Float[np.ndarray, " V"],
     *,
-    rings: int = 3,
+    fade: float = 0.06,
 ) -> Float[np.ndarray, "V 3"]:
     """Moves that smooth cloth [m].
 
@@ -44,11 +45,16 @@ def flatten(
         position: The garment [m].
         mesh: Its collision data.
         share: How far each vertex is to be smoothed, 0 to 1.
-        rings: Rings of faces around it that are smoothed too, less with every one.
+        fade: Distance [m] over which the smoothing fades to half around it, and ends.
     """
     if not share.any():
         return np.zeros_like(position)
     faces, share = mesh.topology.faces, share.copy()
+    edge = mean_edge(position, faces)
+    rings = min(round(fade / edge), _MOST_RINGS)
     for _ in range(rings):
-        np.maximum.at(share, faces.reshape(-1), np.repeat(_DECAY * share[faces].max(axis=1), 3))
-    return _STEP * share[:, None] * (mesh.neighbour_average @ position - position)
+        np.maximum.at(share, faces.reshape(-1), np.repeat(0.5 ** (1 / rings) * share[faces].max(axis=1), 3))
+    smoothed, factor = position, _STEP * share[:, None]
+    for _ in range(min(max(1, round((_FOLD / edge) ** 2)), _MOST_STEPS)):
+        smoothed = smoothed + factor * (mesh.neighbour_average @ smoothed - smoothed)
+    return smoothed - position

@@ -144,7 +144,7 @@ def press(
     result = vertices.copy()
     result[index] += np.where(above[:, None], way[:, None] * (found.point - points), 0.0)
     for _ in range(_SMOOTHINGS):
-        result += flatten(result, mesh, hidden.share, rings=0)
+        result += flatten(result, mesh, hidden.share, fade=0.0)
     return result
 
 
