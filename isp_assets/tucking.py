@@ -55,7 +55,7 @@ class Tucking:
         for garment, hidden, vertices in zip(
             reversed(self.worn), reversed(self._hidden), reversed(layers), strict=True
         ):
-            after = tuck(vertices, garment.collision, covers)
+            after = tuck(vertices, garment.collision, covers, body)
             tucked.append(press(after, garment.collision, hidden, body))
             self._cover(garment, tucked[-1], covers)
         return tucked[::-1]

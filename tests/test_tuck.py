@@ -7,6 +7,9 @@ from collision_shapes import LEFT_ARM, collision, obstacle, tube
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.tuck import GIVE, Hidden, press, tuck
 
+SKIN = obstacle(tube(0.05, low=-0.5, high=0.5))
+"""A body far beneath all that is tucked in here."""
+
 
 def _radius(vertices: np.ndarray) -> np.ndarray:
     return np.linalg.norm(vertices[:, [0, 2]], axis=1)
@@ -14,7 +17,7 @@ def _radius(vertices: np.ndarray) -> np.ndarray:
 
 def test_a_wide_hem_is_drawn_in_under_the_cover_and_the_rest_follows_smoothly() -> None:
     shirt, trousers = tube(0.15, low=-0.3, high=0.3), tube(0.1, low=-0.4, high=0.0)
-    after = tuck(shirt[0], collision(shirt), [obstacle(trousers)])
+    after = tuck(shirt[0], collision(shirt), [obstacle(trousers)], SKIN)
     radius = _radius(after)
     under = shirt[0][:, 1] < -0.07  # below, the border of the cover lets it out softly
     assert radius[under].max() < 0.1 + GIVE + 5e-4
@@ -27,22 +30,31 @@ def test_a_wide_hem_is_drawn_in_under_the_cover_and_the_rest_follows_smoothly() 
 
 def test_what_stands_out_no_further_than_it_may_is_left_alone() -> None:
     inner, outer = tube(0.1 + 0.9 * GIVE), tube(0.1, low=-0.3, high=0.3)
-    assert tuck(inner[0], collision(inner), [obstacle(outer)]) is inner[0]
-    assert tuck(outer[0], collision(outer), [obstacle(inner)]) is outer[0]  # lies beneath already
-    assert tuck(inner[0], collision(inner), []) is inner[0]
+    assert tuck(inner[0], collision(inner), [obstacle(outer)], SKIN) is inner[0]
+    assert tuck(outer[0], collision(outer), [obstacle(inner)], SKIN) is outer[0]  # lies beneath already
+    assert tuck(inner[0], collision(inner), [], SKIN) is inner[0]
 
 
 def test_garments_of_different_parts_or_far_apart_do_not_meet() -> None:
     inner, outer = tube(0.15), tube(0.1, low=-0.3, high=0.3)
-    assert tuck(inner[0], collision(inner, LEFT_ARM), [obstacle(outer)]) is inner[0]
+    assert tuck(inner[0], collision(inner, LEFT_ARM), [obstacle(outer)], SKIN) is inner[0]
     wide = tube(0.3)
-    assert tuck(wide[0], collision(wide), [obstacle(outer)]) is wide[0]
+    assert tuck(wide[0], collision(wide), [obstacle(outer)], SKIN) is wide[0]
+
+
+def test_nothing_is_drawn_into_the_skin() -> None:
+    """The cover cuts deep into the body, as trousers do in a crease of the hip: the shirt stops above it."""
+    shirt, trousers = tube(0.12, low=-0.3, high=0.3), tube(0.06, low=-0.4, high=0.0)
+    body = obstacle(tube(0.1, low=-0.5, high=0.5))
+    after = _radius(tuck(shirt[0], collision(shirt), [obstacle(trousers)], body))
+    assert after.min() == pytest.approx(0.104, abs=5e-4)
+    assert after.min() < 0.105 < _radius(shirt[0]).min()
 
 
 def test_negative_give_is_refused() -> None:
     inner = tube(0.1)
     with pytest.raises(GeometryError, match="give"):
-        tuck(inner[0], collision(inner), [], give=-1.0)
+        tuck(inner[0], collision(inner), [], SKIN, give=-1.0)
 
 
 def test_what_stands_out_of_its_cover_at_rest_is_hidden_and_what_has_room_is_not() -> None:

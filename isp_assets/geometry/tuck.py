@@ -38,6 +38,7 @@ def tuck(
     vertices: Float[np.ndarray, "V 3"],
     mesh: CollisionMesh,
     covers: Sequence[Obstacle],
+    body: Obstacle,
     *,
     give: float = GIVE,
 ) -> Float[np.ndarray, "V 3"]:
@@ -47,6 +48,7 @@ def tuck(
         vertices: The inner garment in this frame [m].
         mesh: Its collision data.
         covers: The garments worn over it, as they are draped before any correction.
+        body: The skin in this frame; nothing is drawn in further than to it.
         give: How far it may stand out of a cover [m]; the cover is lifted by that much later.
 
     Returns:
@@ -76,7 +78,12 @@ def tuck(
     # past a border or round a fold from one frame to the next must not jump.
     held = np.where((firm >= 1)[:, None], pull, 0.0)
     followed = spread(held, mesh.neighbour_average, rings=_RINGS, decay=_DECAY)
-    return vertices + firm[:, None] * pull + (1 - firm[:, None]) * followed
+    moves = firm[:, None] * pull + (1 - firm[:, None]) * followed
+    index = np.flatnonzero(moves.any(axis=1))
+    skin = body.contacts(np.ascontiguousarray(vertices[index], np.float64), mesh.parts[index], within=_REACH)
+    size = np.maximum(np.sqrt(np.einsum("vc,vc->v", moves[index], moves[index])), 1e-9)
+    moves[index] *= ((skin.height - _OVER_BODY).clip(0) / size).clip(max=1)[:, None]
+    return vertices + moves
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
@@ -102,6 +102,7 @@ class LayeringTask:
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.optimizer = options.optimizer
         self.body = body.to(self.device)
+        self.body_collision = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
         self.module = LayeringNet(options.network).to(self.device)
         wardrobe = WardrobeOptions(
             garments=options.garments, edge_length=options.edge_length, map_size=options.network.map_size
@@ -139,7 +140,8 @@ class LayeringTask:
         beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
         depth = 3 if float(torch.rand((), generator=generator)) < self.options.deep_share else 2
         chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (depth,), generator=generator)]
-        layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen])
+        skin = [Obstacle(self.body_collision, v, margin=0.0) for v in posed.vertices.cpu().numpy()]
+        layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen], skin)
         inner: list[tuple[Any, Tensor]] = []
         for wearer, vertices in zip(chosen[:-1], layers[:-1], strict=True):
             if inner:
@@ -199,14 +201,16 @@ class LayeringTask:
         return {name: float(sum(row[name] for row in rows) / len(rows)) for name in rows[0]}
 
 
-def _tucked(wearers: Sequence[Wearer], layers: list[Float[Tensor, "T _ 3"]]) -> list[Float[Tensor, "T _ 3"]]:
+def _tucked(
+    wearers: Sequence[Wearer], layers: list[Float[Tensor, "T _ 3"]], skin: Sequence[Obstacle]
+) -> list[Float[Tensor, "T _ 3"]]:
     """Layers whose wide inner ones gave way to the outer ones, as in use; the outermost stays as it is."""
     arrays = [layer.double().cpu().numpy() for layer in layers]
-    for frame in range(len(arrays[0])):
+    for frame, body in enumerate(skin):
         covers: list[Obstacle] = []
         for index in reversed(range(len(wearers))):
             mesh = wearers[index].collision
-            arrays[index][frame] = tuck(arrays[index][frame], mesh, covers)
+            arrays[index][frame] = tuck(arrays[index][frame], mesh, covers, body)
             covers.append(Obstacle(mesh, arrays[index][frame], margin=0.0))
     return [torch.as_tensor(array).to(layer) for array, layer in zip(arrays, layers, strict=True)]
 
