@@ -21,7 +21,7 @@ _MOST_RINGS, _MOST_STEPS = 16, 9
 def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
     """How little room points have: 1 where the surface beneath touches itself, 0 where cloth may hang freely.
 
-    It follows the room continuously, so that cloth does not flicker.
+    It falls steadily as the room grows, so that cloth does not flicker between two states.
 
     Args:
         obstacle: What lies beneath.
