@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from isp_assets.geometry.closest import Closest, unit_face_normals
+from isp_assets.geometry.closest import Closest, ClosestQuery, unit_face_normals
 from isp_assets.geometry.narrow import narrowness
 from isp_assets.geometry.obstacle import Obstacle
 
@@ -20,11 +20,10 @@ WATCHED = 0.008
 """Vertices this near [m] at the start are looked at again in every round."""
 CLEAR = 0.0003
 """How far [m] a triangle that was found on the wrong side is lifted over the other surface."""
-SAME_SIDE = 0.25
-"""Cosine from which two pieces of surface count as facing the same way."""
-
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
 _FINISH_STEP = 0.002  # largest lift [m] of a crossing triangle in one round
+_POKE_STEP = 0.006  # largest lift [m] of a triangle's corner over a vertex in one round
+_SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
 _PARALLEL = 0.8  # cosine from which a triangle's plane shows the way off it
 _MOST_RINGS = 8
 _COVERING = 2.0  # edges from its open border from which a layer covers what lies beneath it
@@ -100,6 +99,39 @@ def towards(points: Float[np.ndarray, "P 3"], found: Closest) -> Float[np.ndarra
     return np.where(above[:, None], (found.point - points) / length, 0.0)
 
 
+def over_vertices(
+    garment: ClosestQuery,
+    parts: Bool[np.ndarray, "V 6"],
+    neighbour: Neighbour,
+    *,
+    gap: float | None,
+    reach: float,
+) -> Float[np.ndarray, "V 3"]:
+    """Lifts of the corners of the garment's triangles over vertices beneath that poke through them.
+
+    Args:
+        garment: The garment, ready for queries.
+        parts: The parts that its vertices belong to.
+        neighbour: What lies beneath.
+        gap: How far to lift over its vertices [m]; by default half of its margins.
+        reach: What pokes through further than this [m] is left alone.
+    """
+    obstacle, index = neighbour.obstacle, neighbour.vertices
+    found = garment(obstacle.vertices[index])
+    # Vertices keep the whole margin; half of it allows for their chords.
+    above = obstacle.margins[index] / 2 if gap is None else np.full(len(index), gap)
+    facing = np.einsum("pc,pc->p", obstacle.normals.of_vertices[index], found.normal)
+    poking = (found.height > -above) & (found.height < reach) & ~found.on_border
+    hit = np.flatnonzero(poking & (facing > _SAME_SIDE))
+    corner = garment.topology.faces[found.face[hit]]
+    own = (parts[corner].any(1) & obstacle.mesh.parts[index[hit]]).any(1)
+    hit, corner, weights = hit[own], corner[own], found.weights[hit[own]]
+    share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
+    size = (found.height[hit] + above[hit])[:, None] * share
+    push = size.clip(0, _POKE_STEP)[..., None] * found.normal[hit][:, None]
+    return _largest_per_vertex(corner, push, len(garment.vertices))
+
+
 def over_planes(
     position: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -115,11 +147,11 @@ def over_planes(
     top = np.einsum("pkc,pc->pk", obstacle.vertices[theirs], plane).max(1)
     height = np.einsum("pkc,pc->pk", position[mine], plane)
     need = (top[:, None] + CLEAR - height).clip(0, _FINISH_STEP)
-    push = need[..., None] * plane[:, None] * (alike > -SAME_SIDE)[:, None, None]
-    return largest_per_vertex(mine, push, len(position))
+    push = need[..., None] * plane[:, None] * (alike > -_SAME_SIDE)[:, None, None]
+    return _largest_per_vertex(mine, push, len(position))
 
 
-def largest_per_vertex(
+def _largest_per_vertex(
     corner: Int[np.ndarray, "n 3"], push: Float[np.ndarray, "n 3 3"], num_vertices: int
 ) -> Float[np.ndarray, "V 3"]:
     vertex, push = corner.reshape(-1), push.reshape(-1, 3)

@@ -159,7 +159,7 @@ class Obstacle:
     def tight(self) -> Bool[np.ndarray, " V"]:
         """Vertices above which there is no room for cloth: a deep crease, or the body touches itself.
 
-        Nothing can lie there without cutting the surface, so it is neither lifted hard nor blamed.
+        Nothing can lie there without cutting the surface, so what crosses it there is not blamed.
         """
         return self.room < NO_ROOM
 

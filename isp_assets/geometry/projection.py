@@ -25,12 +25,11 @@ from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.lifts import (
     ASIDE,
     CLEAR,
-    SAME_SIDE,
     Neighbour,
     any_corner,
-    largest_per_vertex,
     open_beneath,
     over_planes,
+    over_vertices,
     shortest_way,
 )
 from isp_assets.geometry.narrow import flatten
@@ -44,7 +43,6 @@ BODY_MARGIN = 0.003
 LAYER_MARGIN = 0.0025
 """Clearance to leave over an inner garment [m]."""
 
-_POKE_STEP = 0.006  # largest lift [m] of a triangle's corner in one round
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
 _RIM_REACH = 0.015  # contact deeper than this [m] is left alone there
@@ -262,22 +260,9 @@ class _Projector:
         lift = np.zeros_like(position)
         if not any(len(neighbour.faces) for neighbour in near):
             return lift
-        query, faces = ClosestQuery(position, self.mesh.topology), self.mesh.topology.faces
+        query, reach = ClosestQuery(position, self.mesh.topology), self.options.poke_reach
         for neighbour in near:
-            obstacle, index = neighbour.obstacle, neighbour.vertices
-            found = query(obstacle.vertices[index])
-            # Vertices keep the whole margin; half of it allows for their chords.
-            above = obstacle.margins[index] / 2 if gap is None else np.full(len(index), gap)
-            facing = np.einsum("pc,pc->p", obstacle.normals.of_vertices[index], found.normal)
-            poking = (found.height > -above) & (found.height < self.options.poke_reach) & ~found.on_border
-            hit = np.flatnonzero(poking & (facing > SAME_SIDE))
-            corner = faces[found.face[hit]]
-            own = (self.mesh.parts[corner].any(1) & obstacle.mesh.parts[index[hit]]).any(1)
-            hit, corner, weights = hit[own], corner[own], found.weights[hit[own]]
-            share = weights / np.einsum("pk,pk->p", weights, weights)[:, None]
-            size = (found.height[hit] + above[hit])[:, None] * share
-            push = size.clip(0, _POKE_STEP)[..., None] * found.normal[hit][:, None]
-            keep_larger(lift, largest_per_vertex(corner, push, len(position)))
+            keep_larger(lift, over_vertices(query, self.mesh.parts, neighbour, gap=gap, reach=reach))
         return lift
 
     def _crossings(
