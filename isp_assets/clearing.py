@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from isp_assets.dressing import WornGarment
 from isp_assets.errors import DrapeError
+from isp_assets.geometry.buried import LaidCloth
 from isp_assets.geometry.obstacle import Obstacle
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
 
@@ -24,18 +25,20 @@ Obstacles = Sequence[Sequence[Obstacle]]
 
 
 def clear_layer(
-    worn: WornGarment, vertices: Float[np.ndarray, "T V 3"], obstacles: Obstacles, options: ProjectionOptions
+    worn: WornGarment, laid: Sequence[LaidCloth], obstacles: Obstacles, options: ProjectionOptions
 ) -> list[Projection]:
     """Project every frame of a layer.
 
     Raises:
         DrapeError: If a position is not finite.
     """
-    if not np.isfinite(vertices).all():
+    if not all(np.isfinite(cloth.vertices).all() for cloth in laid):
         raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
     return [
-        project(frame, worn.collision, beneath, options, stretch=worn.stretch)
-        for frame, beneath in zip(vertices, obstacles, strict=True)
+        project(
+            cloth.vertices, worn.collision, beneath, options, stretch=worn.stretch, parts=cloth.parts
+        )
+        for cloth, beneath in zip(laid, obstacles, strict=True)
     ]
 
 
@@ -52,7 +55,7 @@ class Calm:
     def follow(
         self,
         worn: WornGarment,
-        before: Float[np.ndarray, "T V 3"],
+        laid: Sequence[LaidCloth],
         cleared: list[Projection],
         obstacles: Obstacles,
         world_from_pelvis: Float[np.ndarray, "T 3 3"],
@@ -61,19 +64,20 @@ class Calm:
 
         Args:
             worn: The layer.
-            before: Its positions before projection [m].
+            laid: The layer before projection.
             cleared: Its projections.
             obstacles: What lies beneath.
             world_from_pelvis: The pelvis's rotation, with which the moves turn.
         """
         short = replace(self.options, rounds=2, ease=0)
-        result = np.empty(before.shape)
+        result = np.empty((len(laid), *laid[0].vertices.shape))
         for t, (done, turn) in enumerate(zip(cleared, world_from_pelvis, strict=True)):
-            moved = (done.vertices - before[t]) @ turn
+            before = laid[t].vertices
+            moved = (done.vertices - before) @ turn
             if self.moved is not None:
                 moved = self.share * self.moved + (1 - self.share) * moved
             self.moved = moved
-            calmed = before[t] + moved @ turn.T
-            clear = project(calmed, worn.collision, obstacles[t], short).vertices
+            calmed = before + moved @ turn.T
+            clear = project(calmed, worn.collision, obstacles[t], short, parts=laid[t].parts).vertices
             result[t] = np.where((done.tight | done.pressed)[:, None], calmed, clear)
         return result

@@ -28,6 +28,7 @@ from isp_assets.drape_features import drape_features
 from isp_assets.dressing import WornGarment, dress
 from isp_assets.errors import DrapeError
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
+from isp_assets.geometry.buried import BodyObstacle, HomeSkin, LaidCloth, lay_on_skin
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions
@@ -125,6 +126,8 @@ class Draper:
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
         self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
         self.worn = self.tucking.worn if self.tucking else worn
+        mesh, template = self.body_collision, self.body.template.cpu().double().numpy()
+        self.homes = [HomeSkin.find(w.skin.canonical.cpu().double().numpy(), template, mesh) for w in self.worn]
         self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
         self.scene = Scene(
@@ -161,7 +164,8 @@ class Draper:
         skin = posed.vertices.cpu().numpy()
         state.beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
         margin = self.options.body_margin
-        state.obstacles = [[Obstacle(self.body_collision, v, margin=margin)] for v in skin]
+        state.bodies = [BodyObstacle(self.body_collision, v, margin=margin) for v in skin]
+        state.obstacles = [[body] for body in state.bodies]
         alone = [self._drape_alone(worn, posed, state) for worn in self.worn]
         self._tuck(alone, state)
         layers = tuple(self._settle(index, vertices, posed, state) for index, vertices in enumerate(alone))
@@ -183,6 +187,7 @@ class Draper:
         ran: list[list[str]] = [["skin"] for _ in range(len(posed.vertices))]
         with state.timed("skin"):
             vertices, rotations = skin_garment(worn.skin, posed, self.betas)
+        state.skinned.append(vertices)
         state.keep("skin", vertices, self.options.keep_stages)
         if "displace" in self.options.steps and worn.displacement is not None and worn.field is not None:
             with state.timed("displace"):
@@ -238,16 +243,27 @@ class Draper:
         self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
     ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray]]:
         """Projected vertices, and per frame which of them have no room."""
-        worn, before = self.worn[index], vertices.cpu().numpy()
-        cleared = clear_layer(worn, before, state.obstacles, self.options.projection)
+        worn = self.worn[index]
+        laid = self._lay(index, vertices, state)
+        cleared = clear_layer(worn, laid, state.obstacles, self.options.projection)
         for done, ran in zip(cleared, state.steps[index], strict=True):
             if done.ran:
                 ran.append("project")
         result = np.stack([done.vertices for done in cleared])
         if self.options.smoothing:
             turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
-            result = self.calm[index].follow(worn, before, cleared, state.obstacles, turns)
+            result = self.calm[index].follow(worn, laid, cleared, state.obstacles, turns)
         return result.astype(np.float32), [done.tight for done in cleared]
+
+    def _lay(self, index: int, vertices: Float[Tensor, "T V 3"], state: "_ChunkState") -> list[LaidCloth]:
+        """A layer with the cloth of buried skin laid on it."""
+        mesh, home = self.worn[index].collision, self.homes[index]
+        gap = 2 * self.options.body_margin + index * self.options.layer_margin
+        layer = vertices.cpu().double().numpy(), state.skinned[index].cpu().double().numpy()
+        return [
+            lay_on_skin(frame, skinned, mesh, home, body, gap=gap)
+            for frame, skinned, body in zip(*layer, state.bodies, strict=True)
+        ]
 
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
         for worn, positions in zip(self.worn, layers, strict=True):
@@ -265,6 +281,9 @@ class _ChunkState:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.beneath: list[Surface] = []
+        self.skinned: list[Float[Tensor, "T V 3"]] = []
+        """Every layer before it was displaced."""
+        self.bodies: list[BodyObstacle] = []
         self.obstacles: list[list[Obstacle]] = []
         """Per frame: the body, then every finished layer."""
         self.stages: dict[str, list[np.ndarray]] = {}

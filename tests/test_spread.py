@@ -10,7 +10,7 @@ def _field(rings: int, decay: float = 0.9) -> np.ndarray:
     shape = sheet(11)
     move = np.zeros_like(shape[0])
     move[60] = [0, 0.01, 0]  # the middle
-    return spread(move, collision(shape).neighbour_average, rings=rings, decay=decay)[:, 1].reshape(11, 11)
+    return spread(move, collision(shape).topology.neighbour_average, rings=rings, decay=decay)[:, 1].reshape(11, 11)
 
 
 def test_moved_vertices_keep_their_move_and_neighbours_follow_less_and_less() -> None:
@@ -31,13 +31,13 @@ def test_as_many_rings_follow_as_asked_for() -> None:
 
 
 def test_a_field_of_ones_is_kept_by_the_average() -> None:
-    average = collision(sheet(6)).neighbour_average
+    average = collision(sheet(6)).topology.neighbour_average
     np.testing.assert_allclose(average @ np.ones(36), 1.0)
 
 
 def test_no_move_stays_no_move() -> None:
     still = np.zeros((36, 3))
-    assert spread(still, collision(sheet(6)).neighbour_average, rings=4, decay=0.9) is still
+    assert spread(still, collision(sheet(6)).topology.neighbour_average, rings=4, decay=0.9) is still
 
 
 def test_the_longer_of_two_moves_is_kept_per_row() -> None:

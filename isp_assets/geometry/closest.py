@@ -17,6 +17,7 @@ from functools import cached_property
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.topology import edges
@@ -34,6 +35,27 @@ class SurfaceTopology:
     face_edge: Int[np.ndarray, "F 3"]
     """Edge opposite to each corner of a face."""
     border_vertex: Bool[np.ndarray, " V"]
+
+    @cached_property
+    def neighbour_average(self) -> csr_array:
+        """Matrix [V, V] that averages a field over the neighbours of each vertex."""
+        faces, count = self.faces, len(self.border_vertex)
+        row = np.concatenate([faces, faces]).reshape(-1)
+        column = np.concatenate([np.roll(faces, 1, axis=1), np.roll(faces, -1, axis=1)]).reshape(-1)
+        matrix = csr_array((np.ones(len(row)), (row, column)), shape=(count, count))
+        matrix.data[:] = 1.0  # an inner edge is met twice
+        matrix.data /= np.repeat(np.maximum(np.diff(matrix.indptr), 1), np.diff(matrix.indptr))
+        return matrix
+
+    @cached_property
+    def border_rings(self) -> Float[np.ndarray, " V"]:
+        """Edges between each vertex and the open border, counted up to 4."""
+        faces = self.faces
+        rings = np.where(self.border_vertex, 0.0, 4.0)
+        for _ in range(3):
+            nearest = rings[faces].min(1) + 1
+            np.minimum.at(rings, faces.reshape(-1), np.repeat(nearest, 3))
+        return rings
 
     @classmethod
     def build(cls, faces: Int[np.ndarray, "F 3"], num_vertices: int) -> "SurfaceTopology":

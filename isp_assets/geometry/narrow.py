@@ -10,12 +10,13 @@ from jaxtyping import Float
 
 from isp_assets.geometry.closest import Closest
 from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle, mean_edge
+from isp_assets.geometry.spread import fade_out
 
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
 _STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes at once
 _FOLD = 0.018  # about the size of the folds that are smoothed [m], whatever the size of the triangles
-_MOST_RINGS, _MOST_STEPS = 16, 9
+_MOST_STEPS = 9
 
 
 def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
@@ -49,12 +50,9 @@ def flatten(
     """
     if not share.any():
         return np.zeros_like(position)
-    faces, share = mesh.topology.faces, share.copy()
-    edge = mean_edge(position, faces)
-    rings = min(round(fade / edge), _MOST_RINGS)
-    for _ in range(rings):
-        np.maximum.at(share, faces.reshape(-1), np.repeat(0.5 ** (1 / rings) * share[faces].max(axis=1), 3))
+    edge = mean_edge(position, mesh.topology.faces)
+    share = fade_out(share, mesh.topology.faces, half=fade, edge=edge)
     smoothed, factor = position, _STEP * share[:, None]
     for _ in range(min(max(1, round((_FOLD / edge) ** 2)), _MOST_STEPS)):
-        smoothed = smoothed + factor * (mesh.neighbour_average @ smoothed - smoothed)
+        smoothed = smoothed + factor * (mesh.topology.neighbour_average @ smoothed - smoothed)
     return smoothed - position

@@ -14,8 +14,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import (
     Closest,
@@ -47,10 +45,14 @@ def body_parts(
     joint_weights: Float[np.ndarray, "V 24"],
 ) -> tuple[Bool[np.ndarray, "V 6"], Bool[np.ndarray, "V 6"]]:
     """Which of `BODY_PARTS` each vertex belongs to, at least one; and which it may touch as its own."""
-    weight = np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
+    weight = _part_weights(joint_weights)
     parts = weight >= _BELONGS
     parts[np.arange(len(parts)), weight.argmax(1)] = True
     return parts, weight >= _EXTENDS
+
+
+def _part_weights(joint_weights: Float[np.ndarray, "V 24"]) -> Float[np.ndarray, "V 6"]:
+    return np.stack([joint_weights[:, list(joints)].sum(1) for joints in BODY_PARTS.values()], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,8 @@ class CollisionMesh:
     """Which of `BODY_PARTS` each vertex belongs to; at least one."""
     part_faces: tuple[Int[np.ndarray, " _"], ...]
     """Faces of each part; parts overlap."""
+    main_part: Int[np.ndarray, " V"]
+    """The part that each vertex belongs to most."""
 
     @cached_property
     def part_surfaces(self) -> tuple[SurfacePart, ...]:
@@ -69,25 +73,11 @@ class CollisionMesh:
         return tuple(SurfacePart.build(self.topology, faces) for faces in self.part_faces)
 
     @cached_property
-    def neighbour_average(self) -> csr_array:
-        """Matrix [V, V] that averages a field over the neighbours of each vertex."""
-        faces, count = self.topology.faces, len(self.parts)
-        row = np.concatenate([faces, faces]).reshape(-1)
-        column = np.concatenate([np.roll(faces, 1, axis=1), np.roll(faces, -1, axis=1)]).reshape(-1)
-        matrix = csr_array((np.ones(len(row)), (row, column)), shape=(count, count))
-        matrix.data[:] = 1.0  # an inner edge is met twice
-        matrix.data /= np.repeat(np.maximum(np.diff(matrix.indptr), 1), np.diff(matrix.indptr))
-        return matrix
-
-    @cached_property
-    def border_rings(self) -> Float[np.ndarray, " V"]:
-        """Edges between each vertex and the open border, counted up to 4."""
-        faces = self.topology.faces
-        rings = np.where(self.topology.border_vertex, 0.0, 4.0)
-        for _ in range(3):
-            nearest = rings[faces].min(1) + 1
-            np.minimum.at(rings, faces.reshape(-1), np.repeat(nearest, 3))
-        return rings
+    def main_surfaces(self) -> tuple[SurfacePart, ...]:
+        """The faces at each part's main vertices, as surfaces that overlap by one face."""
+        of_face = self.main_part[self.topology.faces]
+        masks = ((of_face == part).any(1) for part in range(len(BODY_PARTS)))
+        return tuple(SurfacePart.build(self.topology, np.flatnonzero(mask)) for mask in masks)
 
     @classmethod
     def build(
@@ -105,7 +95,8 @@ class CollisionMesh:
         parts, extended = body_parts(joint_weights)
         topology = SurfaceTopology.build(faces, len(joint_weights))
         of_face = extended[topology.faces].any(1)
-        return cls(topology, parts, tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS))))
+        part_faces = tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS)))
+        return cls(topology, parts, part_faces, _part_weights(joint_weights).argmax(1))
 
 
 class Obstacle:
@@ -152,8 +143,12 @@ class Obstacle:
         """How far above each vertex another place of the surface lies [m]; 1 cm or four margins at most."""
         half = max(2 * self.margin, NO_ROOM)
         probe = self.whole(self.vertices + half * self.normals.of_vertices)
-        room = (half + probe.height).clip(0)
-        return room if self._tight is None else np.where(self._tight, 0.0, room)
+        return np.where(self.blocked, 0.0, (half + probe.height).clip(0))
+
+    @cached_property
+    def blocked(self) -> Bool[np.ndarray, " V"]:
+        """Vertices that are known to have no room above them."""
+        return self._tight if self._tight is not None else np.zeros(len(self.vertices), bool)
 
     @cached_property
     def tight(self) -> Bool[np.ndarray, " V"]:
@@ -193,7 +188,7 @@ class Obstacle:
 
     def border_rings_at(self, found: Closest) -> Float[np.ndarray, " P"]:
         """Edges between closest points and the open border, counted up to 4."""
-        rings = self.mesh.border_rings[self.mesh.topology.faces[found.face]]
+        rings = self.mesh.topology.border_rings[self.mesh.topology.faces[found.face]]
         return np.einsum("pk,pk->p", rings, found.weights)
 
     def contacts(

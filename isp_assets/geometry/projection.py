@@ -14,7 +14,7 @@ time; obstacles (`Obstacle`) are the body and the finished inner garments.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -102,6 +102,7 @@ def project(
     options: ProjectionOptions | None = None,
     *,
     stretch: StretchLimit | None = None,
+    parts: Bool[np.ndarray, "V 6"] | None = None,
 ) -> Projection:
     """Lift a garment clear of all obstacles.
 
@@ -111,6 +112,7 @@ def project(
         obstacles: What lies beneath: body first, then inner garments.
         options: How hard to work.
         stretch: The garment's limits of stretch; without them nothing is eased.
+        parts: Body parts that its vertices belong to in this frame, if not those of ``mesh``.
 
     Raises:
         GeometryError: If a position is not finite or the mesh does not fit.
@@ -120,6 +122,8 @@ def project(
         raise GeometryError("garment positions hold NaN or infinity; check the networks' output")
     options = options or ProjectionOptions()
     eased = start if stretch is None else stretch.ease(start, steps=options.ease)
+    if parts is not None:
+        mesh = replace(mesh, parts=parts)
     work = _Projector(eased, mesh, obstacles, options, stretch)
     rounds = work.lift()
     work.keep_order()
@@ -166,7 +170,7 @@ class _Projector:
             if np.abs(lift).max(initial=0) < options.tolerance:
                 return done
             rings = 0 if last else options.spread
-            step = spread(lift, self.mesh.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
+            step = spread(lift, self.mesh.topology.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
             self._move(step)
             if last:
                 break

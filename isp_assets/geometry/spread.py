@@ -1,8 +1,10 @@
-"""Fields of moves over a mesh: keep the larger of two, let the neighbourhood follow."""
+"""Fields over a mesh: keep the larger of two, let the neighbourhood follow."""
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
+
+_MOST_RINGS = 16
 
 
 def keep_larger(
@@ -14,6 +16,23 @@ def keep_larger(
     rows = kept if index is None else kept[index]
     larger = np.einsum("vc,vc->v", offered, offered) > np.einsum("vc,vc->v", rows, rows)
     kept[larger if index is None else index[larger]] = offered[larger]
+
+
+def fade_out(
+    share: Float[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"], *, half: float, edge: float
+) -> Float[np.ndarray, " V"]:
+    """Let shares fade around where they are large.
+
+    Args:
+        share: One number a vertex.
+        faces: Triangles.
+        half: Distance [m] over which they fade to half, and end.
+        edge: Mean length of an edge [m].
+    """
+    share, rings = share.copy(), min(round(half / edge), _MOST_RINGS)
+    for _ in range(rings):
+        np.maximum.at(share, faces.reshape(-1), np.repeat(0.5 ** (1 / rings) * share[faces].max(axis=1), 3))
+    return share
 
 
 def spread(

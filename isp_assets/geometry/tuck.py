@@ -77,7 +77,7 @@ def tuck(
     # Where a pull is not firm it fades into what the neighbourhood does: a vertex that slips
     # past a border or round a fold from one frame to the next must not jump.
     held = np.where((firm >= 1)[:, None], pull, 0.0)
-    followed = spread(held, mesh.neighbour_average, rings=_RINGS, decay=_DECAY)
+    followed = spread(held, mesh.topology.neighbour_average, rings=_RINGS, decay=_DECAY)
     moves = firm[:, None] * pull + (1 - firm[:, None]) * followed
     index = np.flatnonzero(moves.any(axis=1))
     skin = body.contacts(np.ascontiguousarray(vertices[index], np.float64), mesh.parts[index], within=_REACH)
