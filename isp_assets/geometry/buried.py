@@ -21,7 +21,7 @@ from isp_assets.geometry.spread import fade_out
 _ARMS = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
 _ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is
 _FROM, _FULL = 0.005, 0.013  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
-_FADE = 0.03  # distance [m] over which neighbouring cloth follows half of that
+_FADE = 0.1  # distance [m] within which neighbouring cloth follows
 
 
 class BodyObstacle(Obstacle):
@@ -126,7 +126,7 @@ def lay_on_skin(
     if not share.any():
         return LaidCloth(position, mesh.parts)
     edge = mean_edge(position, mesh.topology.faces)
-    share = fade_out(share * share * (3 - 2 * share), mesh.topology.faces, half=_FADE, edge=edge)
+    share = fade_out(share * share * (3 - 2 * share), mesh.topology.faces, reach=_FADE, edge=edge)
     skin = home.at(body.vertices)
     away = skinned - skin
     length = np.sqrt(np.einsum("vc,vc->v", away, away))

@@ -14,6 +14,7 @@ from functools import cached_property
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
@@ -24,7 +25,8 @@ INNER_REACH = 0.02
 
 _SPLITS = 4  # a face on both sides is cut into this many strips, 16 small triangles
 _ROOM = 0.006  # clearance [m] that cloth needs over the body
-_NEAR = 0.015  # a point this near [m] to skin without room is excused
+_NEAR = 0.015  # a point this near [m] to skin without room is excused,
+_OVER = 0.03  # or this far [m] on its outer side, as a sleeve on an arm inside the torso
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,25 @@ class Beneath:
         """Vertices of a body above which cloth finds no room: creases, and parts that press together."""
         if not self.closed:
             return np.zeros(len(self.vertices), bool)
-        probe = self.vertices + _ROOM * self.closest.normals.of_vertices
-        return self._winding.winding_number(probe).reshape(-1) > 0.5
+        return self._inside(self.vertices + _ROOM * self.closest.normals.of_vertices)
+
+    @cached_property
+    def _places_without_room(self) -> cKDTree | None:
+        """The same, sampled more finely than a body's triangles are; None if there are none."""
+        faces = self.topology.faces
+        around = np.isin(faces, faces[self.without_room[faces].any(1)]).any(1)
+        if not around.any():
+            return None
+        corner, normal = self.vertices[faces[around]], self.closest.normals.of_vertices[faces[around]]
+        weights = _subdivision(_SPLITS)
+        point = np.einsum("qk,fkc->fqc", weights, corner).reshape(-1, 3)
+        away = np.einsum("qk,fkc->fqc", weights, normal).reshape(-1, 3)
+        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        point = point[self._inside(point + _ROOM * away)]
+        return cKDTree(point, balanced_tree=False) if len(point) else None
+
+    def _inside(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+        return np.asarray(self._winding.winding_number(points).reshape(-1) > 0.5)
 
     def depth(
         self, points: Float[np.ndarray, "P 3"]
@@ -92,8 +111,10 @@ class Beneath:
             inside = found.height < 0
             cramped = self.without_room[self.topology.faces[found.face]].any(1)
             if cramped.any():
-                inside[cramped] = self._winding.winding_number(points[cramped]).reshape(-1) > 0.5
-            excused = cramped & (distance < _NEAR)
+                inside[cramped] = self._inside(points[cramped])
+            excused = cramped & (found.height > 0) & (distance < _OVER)
+            if self._places_without_room is not None:
+                excused |= self._places_without_room.query(points)[0] < _NEAR
         else:
             inside = (found.height < 0) & ~found.on_border & (distance < INNER_REACH)
             excused = np.zeros(len(points), bool)

@@ -17,6 +17,7 @@ _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, i
 _STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes at once
 _FOLD = 0.018  # about the size of the folds that are smoothed [m], whatever the size of the triangles
 _MOST_STEPS = 9
+_FADE = 0.12  # distance [m] within which cloth around it is smoothed too
 
 
 def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
@@ -38,7 +39,7 @@ def flatten(
     mesh: CollisionMesh,
     share: Float[np.ndarray, " V"],
     *,
-    fade: float = 0.06,
+    fade: float = _FADE,
 ) -> Float[np.ndarray, "V 3"]:
     """Moves that smooth cloth [m].
 
@@ -46,12 +47,12 @@ def flatten(
         position: The garment [m].
         mesh: Its collision data.
         share: How far each vertex is to be smoothed, 0 to 1.
-        fade: Distance [m] over which the smoothing fades to half around it, and ends.
+        fade: Distance [m] over which the smoothing fades around it.
     """
     if not share.any():
         return np.zeros_like(position)
     edge = mean_edge(position, mesh.topology.faces)
-    share = fade_out(share, mesh.topology.faces, half=fade, edge=edge)
+    share = fade_out(share, mesh.topology.faces, reach=fade, edge=edge)
     smoothed, factor = position, _STEP * share[:, None]
     for _ in range(min(max(1, round((_FOLD / edge) ** 2)), _MOST_STEPS)):
         smoothed = smoothed + factor * (mesh.topology.neighbour_average @ smoothed - smoothed)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-_MOST_RINGS = 16
+_MOST_RINGS = 24
 
 
 def keep_larger(
@@ -19,19 +19,19 @@ def keep_larger(
 
 
 def fade_out(
-    share: Float[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"], *, half: float, edge: float
+    share: Float[np.ndarray, " V"], faces: Int[np.ndarray, "F 3"], *, reach: float, edge: float
 ) -> Float[np.ndarray, " V"]:
-    """Let shares fade around where they are large.
+    """Let shares fade steadily around where they are large.
 
     Args:
-        share: One number a vertex.
+        share: One number a vertex, 0 to 1.
         faces: Triangles.
-        half: Distance [m] over which they fade to half, and end.
+        reach: Distance [m] over which 1 fades to 0.
         edge: Mean length of an edge [m].
     """
-    share, rings = share.copy(), min(round(half / edge), _MOST_RINGS)
-    for _ in range(rings):
-        np.maximum.at(share, faces.reshape(-1), np.repeat(0.5 ** (1 / rings) * share[faces].max(axis=1), 3))
+    share, rings = share.copy(), min(round(reach / edge), _MOST_RINGS)
+    for _ in range(rings - 1):
+        np.maximum.at(share, faces.reshape(-1), np.repeat(share[faces].max(axis=1) - 1 / rings, 3))
     return share
 
 
