@@ -35,9 +35,7 @@ def clear_layer(
     if not all(np.isfinite(cloth.vertices).all() for cloth in laid):
         raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
     return [
-        project(
-            cloth.vertices, worn.collision, beneath, options, stretch=worn.stretch, parts=cloth.parts
-        )
+        project(cloth.vertices, worn.collision, beneath, options, stretch=worn.stretch, parts=cloth.parts)
         for cloth, beneath in zip(laid, obstacles, strict=True)
     ]
 

@@ -127,7 +127,9 @@ class Draper:
         self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
         self.worn = self.tucking.worn if self.tucking else worn
         mesh, template = self.body_collision, self.body.template.cpu().double().numpy()
-        self.homes = [HomeSkin.find(w.skin.canonical.cpu().double().numpy(), template, mesh) for w in self.worn]
+        self.homes = [
+            HomeSkin.find(w.skin.canonical.cpu().double().numpy(), template, mesh) for w in self.worn
+        ]
         self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
         self.scene = Scene(

@@ -10,7 +10,9 @@ def _field(rings: int, decay: float = 0.9) -> np.ndarray:
     shape = sheet(11)
     move = np.zeros_like(shape[0])
     move[60] = [0, 0.01, 0]  # the middle
-    return spread(move, collision(shape).topology.neighbour_average, rings=rings, decay=decay)[:, 1].reshape(11, 11)
+    return spread(move, collision(shape).topology.neighbour_average, rings=rings, decay=decay)[:, 1].reshape(
+        11, 11
+    )
 
 
 def test_moved_vertices_keep_their_move_and_neighbours_follow_less_and_less() -> None:

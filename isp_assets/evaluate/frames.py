@@ -23,8 +23,9 @@ FINAL = "final"
 
 FIGURES: dict[str, str] = {
     "body_area_percent": "share of the garment's area inside the body, where room was left for it [%]",
-    "body_unavoidable_percent": "share inside the body where the body leaves no room for cloth [%]",
+    "body_unavoidable_percent": "share inside the body where it leaves no room for so many layers [%]",
     "inner_area_percent": "share beneath an inner layer, at most 2 cm deep; the worst inner layer [%]",
+    "inner_unavoidable_percent": "the same where the body leaves no room for so many layers [%]",
     "body_crossing_pairs": "pairs of triangles that cross, with the body",
     "inner_crossing_pairs": "pairs of triangles that cross, with all inner layers",
     "crossing_pairs": "pairs of triangles that cross, with anything beneath",
@@ -73,10 +74,12 @@ class FrameMeter:
                 raise GeometryError(
                     f"layer {meter.name}: positions hold NaN or infinity; nothing can be measured"
                 )
-            on_body = measure_intersection(vertices, meter.topology.faces, body)
-            on_inner = [measure_intersection(vertices, meter.topology.faces, layer) for layer in inner]
+            on_body, *on_inner = (
+                measure_intersection(vertices, meter.topology.faces, beneath, layers=len(inner))
+                for beneath in (body, *inner)
+            )
             figures[meter.name] = _contact_figures(on_body, on_inner) | meter.shape_figures(vertices)
-            inner.append(Beneath(vertices, meter.topology, closed=False))
+            inner.append(Beneath(vertices, meter.topology, closed=False, body=body))
         return figures
 
 
@@ -134,6 +137,7 @@ def _contact_figures(body: Intersection, inner: list[Intersection]) -> dict[str,
         "body_area_percent": body.area_percent,
         "body_unavoidable_percent": body.unavoidable_percent,
         "inner_area_percent": max((found.area_percent for found in inner), default=0.0),
+        "inner_unavoidable_percent": max((found.unavoidable_percent for found in inner), default=0.0),
         "body_crossing_pairs": float(body.crossing_pairs),
         "inner_crossing_pairs": float(inner_pairs),
         "crossing_pairs": float(body.crossing_pairs + inner_pairs),

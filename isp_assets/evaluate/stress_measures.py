@@ -25,6 +25,7 @@ FIGURES: dict[str, str] = {
     "body_unavoidable_max": "area inside the body where the body leaves no room for cloth, worst frame [%]",
     "inner_area_mean": "area inside a layer beneath, of the worst layer: mean [%]",
     "inner_area_max": "the same in the worst frame [%]",
+    "inner_unavoidable_max": "the same where the body leaves no room for so many layers [%]",
     "before_body_area_max": "inside the body before projection, worst frame [%]",
     "before_inner_area_max": "inside a layer beneath before projection, worst frame [%]",
     "crossing_pairs": "pairs of triangles that cross, with anything beneath: worst layer and frame",
@@ -120,8 +121,8 @@ def _worst_layer(figures: Mapping[str, float], faces: Mapping[str, int]) -> dict
             continue
         if figure == "flipped_faces":
             figure, value = "flipped_percent", 100 * value / faces[layer]
-        elif figure == "body_unavoidable_percent":
-            figure = "body_unavoidable_max"
+        elif figure.endswith("_unavoidable_percent"):
+            figure = figure.replace("percent", "max")
         name = figure if stage == FINAL else f"before_{figure}"
         found[name] = max(found.get(name, 0.0), value)
     return found
@@ -133,7 +134,7 @@ _MEAN_AND_MAX = {
     "strain_p99": "strain_p99",
 }
 _MAX = (
-    "body_unavoidable_max", "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio",
+    "body_unavoidable_max", "inner_unavoidable_max", "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio",
     "before_jump_ratio",
     "anchor_jump_ratio", "far_percent",
     "corrected_3cm", "corrected_mm", "difference_mm", "before_difference_mm",

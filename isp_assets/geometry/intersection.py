@@ -1,9 +1,9 @@
 """How much of a garment lies where it must not: inside the body, or inside an inner garment.
 
 Four figures for a pair: area fraction, number of crossing triangle pairs, deepest
-penetration, and the area fraction that no garment could avoid (the body itself
-leaves no room there). Areas come from quadrature points on the faces, refined where
-a face lies on both sides.
+penetration, and the area fraction that no garment could avoid: the body itself
+leaves no room there, for one layer of cloth or for as many as are worn. Areas come from
+quadrature points on the faces, refined where a face lies on both sides.
 
 Positions are in metres, in one shared space. NumPy, one frame at a time.
 """
@@ -24,9 +24,10 @@ INNER_REACH = 0.02
 """How far beneath an inner garment [m] a point still counts as inside it."""
 
 _SPLITS = 4  # a face on both sides is cut into this many strips, 16 small triangles
-_ROOM = 0.006  # clearance [m] that cloth needs over the body
+_SKIN_SPLITS = 2  # the same for triangles of the body where room is looked for
 _NEAR = 0.015  # a point this near [m] to skin without room is excused,
 _OVER = 0.03  # or this far [m] on its outer side, as a sleeve on an arm inside the torso
+_AROUND = 0.03  # triangles of a body with their middle this near [m] to a point are looked at
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,12 @@ class Beneath:
     """A surface in one frame that garments are measured against; prepared once, used for every layer."""
 
     def __init__(
-        self, vertices: Float[np.ndarray, "V 3"], topology: SurfaceTopology, *, closed: bool
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        topology: SurfaceTopology,
+        *,
+        closed: bool,
+        body: "Beneath | None" = None,
     ) -> None:
         """Place a surface.
 
@@ -56,6 +62,7 @@ class Beneath:
             topology: Its connectivity.
             closed: True for a body: inside is where the winding number exceeds one half.
                 False for a garment: inside is beneath its nearest triangle, at most ``INNER_REACH``.
+            body: What wears the garment; without it, no place counts as unavoidable.
         """
         if closed and topology.border_vertex.any():
             raise GeometryError(
@@ -64,6 +71,7 @@ class Beneath:
         self.vertices = np.ascontiguousarray(vertices, np.float64)
         self.topology = topology
         self.closed = closed
+        self.body = self if closed else body
 
     @cached_property
     def closest(self) -> ClosestQuery:
@@ -80,45 +88,55 @@ class Beneath:
         """Vertices of a body above which cloth finds no room: creases, and parts that press together."""
         if not self.closed:
             return np.zeros(len(self.vertices), bool)
-        return self._inside(self.vertices + _ROOM * self.closest.normals.of_vertices)
+        return self._inside(self.vertices + _room(0) * self.closest.normals.of_vertices)
 
-    @cached_property
-    def _places_without_room(self) -> cKDTree | None:
-        """The same, sampled more finely than a body's triangles are; None if there are none."""
-        faces = self.topology.faces
-        around = np.isin(faces, faces[self.without_room[faces].any(1)]).any(1)
-        if not around.any():
-            return None
-        corner, normal = self.vertices[faces[around]], self.closest.normals.of_vertices[faces[around]]
-        weights = _subdivision(_SPLITS)
-        point = np.einsum("qk,fkc->fqc", weights, corner).reshape(-1, 3)
-        away = np.einsum("qk,fkc->fqc", weights, normal).reshape(-1, 3)
+    def leaves_no_room(self, points: Float[np.ndarray, "P 3"], layers: int) -> Bool[np.ndarray, " P"]:
+        """Whether a body's skin near points has no room for cloth over so many layers.
+
+        Skin is sampled more finely than the body's triangles are.
+        """
+        faces, normals, room = self.topology.faces, self.closest.normals.of_vertices, _room(layers)
+        middle = self.vertices[faces].mean(1)
+        distance, _ = cKDTree(points, balanced_tree=False).query(middle, distance_upper_bound=_AROUND)
+        around = faces[distance < _AROUND]
+        weights = _subdivision(_SKIN_SPLITS)
+        skin = np.einsum("qk,fkc->fqc", weights, self.vertices[around]).reshape(-1, 3)
+        away = np.einsum("qk,fkc->fqc", weights, normals[around]).reshape(-1, 3)
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        point = point[self._inside(point + _ROOM * away)]
-        return cKDTree(point, balanced_tree=False) if len(point) else None
+        skin = skin[self._inside(skin + room * away)]
+        if len(skin) == 0:
+            return np.zeros(len(points), bool)
+        found, _ = cKDTree(skin, balanced_tree=False).query(points, distance_upper_bound=_NEAR)
+        return np.asarray(found < _NEAR)
 
     def _inside(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
         return np.asarray(self._winding.winding_number(points).reshape(-1) > 0.5)
 
     def depth(
-        self, points: Float[np.ndarray, "P 3"]
+        self, points: Float[np.ndarray, "P 3"], layers: int = 0
     ) -> tuple[Float[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
-        """Depth [m] of points on the wrong side, 0 elsewhere; and whether the body leaves no room there."""
+        """Depth [m] of points on the wrong side, 0 elsewhere; and whether the body leaves no room there.
+
+        Args:
+            points: Where to measure [m].
+            layers: How many garments are worn beneath the one that is measured.
+        """
         found = self.closest(points)
         distance = np.abs(found.height)
         if self.closed:
             # The nearest triangle misleads only where the body cuts itself: ask the winding number there.
             inside = found.height < 0
-            cramped = self.without_room[self.topology.faces[found.face]].any(1)
-            if cramped.any():
-                inside[cramped] = self._inside(points[cramped])
-            excused = cramped & (found.height > 0) & (distance < _OVER)
-            if self._places_without_room is not None:
-                excused |= self._places_without_room.query(points)[0] < _NEAR
+            above = self.without_room[self.topology.faces[found.face]].any(1)
+            if above.any():
+                inside[above] = self._inside(points[above])
+            excused = above & (found.height > 0) & (distance < _OVER)
         else:
             inside = (found.height < 0) & ~found.on_border & (distance < INNER_REACH)
             excused = np.zeros(len(points), bool)
-        return np.where(inside, distance, 0.0), excused
+        rest = np.flatnonzero(inside & ~excused)
+        if len(rest) and self.body is not None:
+            excused[rest] = self.body.leaves_no_room(points[rest], layers)
+        return np.where(inside, distance, 0.0), excused & inside
 
     def box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Bounds of the points that may lie inside [m]."""
@@ -126,10 +144,25 @@ class Beneath:
         return self.vertices.min(0) - grow, self.vertices.max(0) + grow
 
 
+def _room(layers: int) -> float:
+    """Clearance [m] that cloth needs over the body: more for every layer beneath, one on either side."""
+    return 0.006 + 0.005 * layers
+
+
 def measure_intersection(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], beneath: Beneath
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    beneath: Beneath,
+    *,
+    layers: int = 0,
 ) -> Intersection:
     """Measure one garment against one surface.
+
+    Args:
+        vertices: The garment [m].
+        faces: Its triangles.
+        beneath: The body, or a garment worn beneath.
+        layers: How many garments are worn beneath it: so many more need room.
 
     Raises:
         GeometryError: If a position is not finite.
@@ -141,7 +174,7 @@ def measure_intersection(
     areas = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     low, high = beneath.box()
     near = np.flatnonzero(((corner.max(1) >= low) & (corner.min(1) <= high)).all(1))
-    wrong, excused, deepest = _wrong_shares(vertices, faces[near], beneath)
+    wrong, excused, deepest = _wrong_shares(vertices, faces[near], beneath, layers)
     total = max(areas.sum(), 1e-30)
     pairs = crossing_pairs(vertices, faces, beneath.vertices, beneath.topology.faces)
     return Intersection(
@@ -153,14 +186,17 @@ def measure_intersection(
 
 
 def _wrong_shares(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], beneath: Beneath
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    beneath: Beneath,
+    layers: int,
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"], float]:
     """Share of each face on the wrong side, the excused part of it, and the deepest sample not excused."""
     if len(faces) == 0:
         return np.zeros(0), np.zeros(0), 0.0
     used, index = np.unique(faces, return_inverse=True)
     samples = np.concatenate([vertices[used], vertices[faces].mean(1)])
-    depth, excuse = beneath.depth(samples)
+    depth, excuse = beneath.depth(samples, layers)
     of_face = np.concatenate([index.reshape(-1, 3), len(used) + np.arange(len(faces))[:, None]], axis=1)
     inside = depth[of_face] > 0
     wrong = inside.mean(1)
@@ -170,7 +206,7 @@ def _wrong_shares(
     if len(mixed):
         weights = _subdivision(_SPLITS)
         fine = np.einsum("qk,fkc->fqc", weights, vertices[faces[mixed]])
-        depth, excuse = (part.reshape(len(mixed), -1) for part in beneath.depth(fine.reshape(-1, 3)))
+        depth, excuse = (part.reshape(len(mixed), -1) for part in beneath.depth(fine.reshape(-1, 3), layers))
         wrong[mixed] = (depth > 0).mean(1)
         excused[mixed] = ((depth > 0) & excuse).mean(1)
         deepest = max(deepest, float(np.where(excuse, 0, depth).max()))
