@@ -10,9 +10,6 @@ Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
 Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
 """
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,10 +22,11 @@ from isp_assets.clearing import Calm, clear_layer
 from isp_assets.conventions import NUM_JOINTS, FrameRange
 from isp_assets.displacement import displace, displacements
 from isp_assets.drape_features import drape_features
+from isp_assets.drape_state import ChunkState, note
 from isp_assets.dressing import WornGarment, dress
 from isp_assets.errors import DrapeError
 from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
-from isp_assets.geometry.buried import BodyObstacle, HomeSkin, LaidCloth, lay_on_skin
+from isp_assets.geometry.buried import BodyObstacle, HomeSkin, lay_on_skin
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions
@@ -126,9 +124,13 @@ class Draper:
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
         self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
         self.worn = self.tucking.worn if self.tucking else worn
-        mesh, template = self.body_collision, self.body.template.cpu().double().numpy()
         self.homes = [
-            HomeSkin.find(w.skin.canonical.cpu().double().numpy(), template, mesh) for w in self.worn
+            HomeSkin.find(
+                w.skin.canonical.cpu().double().numpy(),
+                shot.body.template.double().numpy(),
+                self.body_collision,
+            )
+            for w in self.worn
         ]
         self.calm = [Calm(options.smoothing, options.projection) for _ in self.worn]
         numbers = shot.motion.frames
@@ -156,7 +158,7 @@ class Draper:
             DrapeError: If a result is not finite.
         """
         motion, device = self.shot.motion, self.options.device
-        state = _ChunkState()
+        state = ChunkState()
         with state.timed("body"):
             posed = self.body.pose(
                 torch.as_tensor(motion.poses[rows], dtype=torch.float32, device=device),
@@ -182,9 +184,7 @@ class Draper:
             steps=tuple(tuple(tuple(layer[t]) for layer in state.steps) for t in range(len(frames))),
         )
 
-    def _drape_alone(
-        self, worn: WornGarment, posed: PosedBody, state: "_ChunkState"
-    ) -> Float[Tensor, "T V 3"]:
+    def _drape_alone(self, worn: WornGarment, posed: PosedBody, state: ChunkState) -> Float[Tensor, "T V 3"]:
         """One garment as if it were the only one."""
         ran: list[list[str]] = [["skin"] for _ in range(len(posed.vertices))]
         with state.timed("skin"):
@@ -196,12 +196,12 @@ class Draper:
                 features = drape_features(posed, self.betas, worn.code, num_betas=worn.field.config.num_betas)
                 moved = displacements(worn.displacement, worn.field, features)
                 vertices = displace(vertices, rotations, moved)
-            _note(ran, "displace")
+            note(ran, "displace")
         state.keep("displace", vertices, self.options.keep_stages)
         state.steps.append(ran)
         return vertices
 
-    def _tuck(self, layers: list[Float[Tensor, "T _ 3"]], state: "_ChunkState") -> None:
+    def _tuck(self, layers: list[Float[Tensor, "T _ 3"]], state: ChunkState) -> None:
         """Let wide inner layers give way to held layers over them; replaces entries of ``layers``."""
         if self.tucking is not None:
             with state.timed("tuck"):
@@ -216,7 +216,7 @@ class Draper:
             state.keep("tuck", vertices, self.options.keep_stages)
 
     def _settle(
-        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
+        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: ChunkState
     ) -> Float[np.ndarray, "T V 3"]:
         """Correct one garment against everything beneath it, and add it to what lies beneath."""
         worn, ran = self.worn[index], state.steps[index]
@@ -226,7 +226,7 @@ class Draper:
                 vertices, touched = correct_layer(
                     worn.layering, vertices, state.beneath, posed, ramp=worn.ramp
                 )
-            _note(ran, "layering", touched)
+            note(ran, "layering", touched)
         state.keep("layering", vertices, keep)
         result = vertices.cpu().numpy()
         tight: list[np.ndarray] | None = None
@@ -242,11 +242,16 @@ class Draper:
         return result
 
     def _clear(
-        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: "_ChunkState"
+        self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: ChunkState
     ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray]]:
         """Projected vertices, and per frame which of them have no room."""
-        worn = self.worn[index]
-        laid = self._lay(index, vertices, state)
+        worn, home = self.worn[index], self.homes[index]
+        before, skinned = (part.cpu().double().numpy() for part in (vertices, state.skinned[index]))
+        gap = 2 * self.options.body_margin + index * self.options.layer_margin
+        laid = [
+            lay_on_skin(frame, own, worn.collision, home, body, gap=gap)
+            for frame, own, body in zip(before, skinned, state.bodies, strict=True)
+        ]
         cleared = clear_layer(worn, laid, state.obstacles, self.options.projection)
         for done, ran in zip(cleared, state.steps[index], strict=True):
             if done.ran:
@@ -257,16 +262,6 @@ class Draper:
             result = self.calm[index].follow(worn, laid, cleared, state.obstacles, turns)
         return result.astype(np.float32), [done.tight for done in cleared]
 
-    def _lay(self, index: int, vertices: Float[Tensor, "T V 3"], state: "_ChunkState") -> list[LaidCloth]:
-        """A layer with the cloth of buried skin laid on it."""
-        mesh, home = self.worn[index].collision, self.homes[index]
-        gap = 2 * self.options.body_margin + index * self.options.layer_margin
-        layer = vertices.cpu().double().numpy(), state.skinned[index].cpu().double().numpy()
-        return [
-            lay_on_skin(frame, skinned, mesh, home, body, gap=gap)
-            for frame, skinned, body in zip(*layer, state.bodies, strict=True)
-        ]
-
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
         for worn, positions in zip(self.worn, layers, strict=True):
             bad = ~np.isfinite(positions).all((1, 2))
@@ -275,35 +270,3 @@ class Draper:
                     f"layer {worn.layer.name}: positions are not finite in frame {frames[bad][0]}; "
                     "the pose, betas or code lies far outside the trained range"
                 )
-
-
-class _ChunkState:
-    """What the layers of one chunk hand on to the next layer."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.beneath: list[Surface] = []
-        self.skinned: list[Float[Tensor, "T V 3"]] = []
-        """Every layer before it was displaced."""
-        self.bodies: list[BodyObstacle] = []
-        self.obstacles: list[list[Obstacle]] = []
-        """Per frame: the body, then every finished layer."""
-        self.stages: dict[str, list[np.ndarray]] = {}
-        self.steps: list[list[list[str]]] = []
-        """Per layer and frame: names of the rungs that ran."""
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-    def keep(self, stage: str, vertices: Float[Tensor, "T V 3"], wanted: bool) -> None:
-        if wanted:
-            self.stages.setdefault(stage, []).append(vertices.cpu().numpy())
-
-
-def _note(ran: list[list[str]], step: str, where: np.ndarray | None = None) -> None:
-    for t, steps in enumerate(ran):
-        if where is None or where[t]:
-            steps.append(step)

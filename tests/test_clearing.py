@@ -1,5 +1,7 @@
 """Calming over time: exact in any pieces, nothing in the first frame, a fixed point where nothing moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from isp_assets.clearing import Calm, clear_layer
 from isp_assets.collection import Collection
 from isp_assets.dressing import WornGarment, dress
 from isp_assets.errors import DrapeError
+from isp_assets.geometry.buried import LaidCloth
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import Projection, ProjectionOptions
 from isp_assets.motion import Motion
@@ -26,7 +29,8 @@ class Scene:
         self.worn: WornGarment = dress(Collection.load().outfit(["tee"]), body, betas, resolution=40)[0]
         motion = Motion.load("walk")
         posed = body.pose(torch.as_tensor(motion.poses[40 : 40 + FRAMES], dtype=torch.float32))
-        self.before = skin_garment(self.worn.skin, posed, betas)[0].numpy()
+        skinned = skin_garment(self.worn.skin, posed, betas)[0].double().numpy()
+        self.before = [LaidCloth(frame, self.worn.collision.parts) for frame in skinned]
         mesh = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
         self.obstacles = [[Obstacle(mesh, v, margin=0.003)] for v in posed.vertices.numpy()]
         self.turns = posed.joint_transforms[:, 0, :3, :3].numpy()
@@ -67,7 +71,7 @@ def test_moves_that_stay_the_same_are_kept(scene: Scene) -> None:
     caught = scene.cleared[0].tight | scene.cleared[0].pressed
     np.testing.assert_allclose(same[2][caught], same[0][caught], atol=1e-6)
     assert calm.moved is not None
-    moved = (scene.cleared[0].vertices - scene.before[0]) @ scene.turns[0]
+    moved = (scene.cleared[0].vertices - scene.before[0].vertices) @ scene.turns[0]
     np.testing.assert_allclose(calm.moved, moved, atol=1e-6)
 
 
@@ -78,15 +82,17 @@ def test_moves_follow_exponentially(scene: Scene) -> None:
     start = calm.moved
     assert start is not None
     still = [
-        Projection(v, False, 0, 0.0, done.tight, done.pressed, 0)
-        for v, done in zip(scene.before, scene.cleared, strict=True)
+        Projection(cloth.vertices, False, 0, 0.0, done.tight, done.pressed, 0)
+        for cloth, done in zip(scene.before, scene.cleared, strict=True)
     ]
     calm.follow(scene.worn, scene.before[:2], still[:2], scene.obstacles[:2], scene.turns[:2])
     np.testing.assert_allclose(calm.moved, 0.25 * start, atol=1e-7)
 
 
 def test_positions_that_are_not_finite_are_refused(scene: Scene) -> None:
-    broken = scene.before.copy()
-    broken[1, 5] = np.nan
+    broken = list(scene.before)
+    vertices = broken[1].vertices.copy()
+    vertices[5] = np.nan
+    broken[1] = replace(broken[1], vertices=vertices)
     with pytest.raises(DrapeError, match="L00_tee: positions are not finite"):
         clear_layer(scene.worn, broken, scene.obstacles, OPTIONS)

@@ -82,6 +82,34 @@ def test_depth_beyond_reach_and_beyond_the_border_do_not_count() -> None:
     assert measure_intersection(deep.vertices, deep.faces, inner).area_percent == pytest.approx(100)
 
 
+def test_cloth_on_the_outer_side_of_buried_skin_is_excused_up_to_three_centimetres() -> None:
+    """A sleeve about an arm inside the torso, and one so wide that it has nothing to do with the arm."""
+    arm = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    body = _beneath(trimesh.util.concatenate([BALL, arm]))
+    for radius, excused in ((0.04, 100), (0.065, 0)):
+        sleeve = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        found = measure_intersection(sleeve.vertices, sleeve.faces, body)
+        assert found.unavoidable_percent == pytest.approx(excused)
+        assert found.area_percent == pytest.approx(100 - excused)
+
+
+def test_more_layers_need_more_room() -> None:
+    """Slabs 14 mm apart: a second layer (11 mm) has room between them, a third one (16 mm) has none."""
+    slabs = [trimesh.creation.box((0.3, 0.1, 0.3)).subdivide_to_size(0.05) for _ in range(2)]
+    for slab, side in zip(slabs, (-1, 1), strict=True):
+        slab.apply_translation([0, side * 0.057, 0])
+    body = _beneath(trimesh.util.concatenate(slabs))
+    inner = _sheet(10, size=0.1, height=0.001)
+    outer = _sheet(10, size=0.08, height=-0.001)
+    faces = np.asarray(inner.faces, np.int64)
+    topology = SurfaceTopology.build(faces, len(inner.vertices))
+    beneath = Beneath(np.asarray(inner.vertices), topology, closed=False, body=body)
+    for layers, excused in ((1, 0), (2, 100)):
+        found = measure_intersection(outer.vertices, outer.faces, beneath, layers=layers)
+        assert found.unavoidable_percent == pytest.approx(excused)
+        assert found.area_percent == pytest.approx(100 - excused)
+
+
 def test_a_body_that_cuts_itself_still_has_one_inside_and_its_seam_is_excused() -> None:
     twin = trimesh.util.concatenate([BALL, BALL.copy().apply_translation([0.15, 0, 0])])
     body = _beneath(twin)

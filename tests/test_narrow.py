@@ -1,5 +1,7 @@
 """Little room: how little is seen, and that smoothing flattens what lies there and nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from collision_shapes import collision, obstacle, sheet
@@ -7,7 +9,7 @@ from collision_shapes import collision, obstacle, sheet
 from isp_assets.geometry.intersection import Beneath, measure_intersection
 from isp_assets.geometry.lifts import open_beneath
 from isp_assets.geometry.narrow import flatten, narrowness
-from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle
+from isp_assets.geometry.obstacle import NO_ROOM, Obstacle
 from isp_assets.geometry.projection import project
 
 TORSO, LEFT_ARM = 0, 2  # in the order of the body's parts
@@ -101,7 +103,7 @@ def test_a_layer_covers_a_part_only_where_it_belongs_to_that_part_alone() -> Non
     parts = np.zeros_like(mesh.parts)
     parts[:, TORSO] = True
     parts[vertices[:, 0] > 0, LEFT_ARM] = True
-    vest = Obstacle(CollisionMesh(mesh.topology, parts, mesh.part_faces), vertices, margin=0.0025)
+    vest = Obstacle(replace(mesh, parts=parts), vertices, margin=0.0025)
     points = np.array([[-0.05, 0.004, 0.0], [0.05, 0.004, 0.0]])
     wanted = np.zeros((2, 6), bool)
     wanted[:, [TORSO, LEFT_ARM]] = True

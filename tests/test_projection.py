@@ -1,5 +1,7 @@
 """Projection: what it clears, what it leaves alone, and that it does neither too much nor too far."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -118,7 +120,7 @@ def _body(own: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarra
     parts = np.zeros_like(mesh.parts)
     parts[is_own, part] = parts[~is_own, 0] = True
     faces_of = [np.flatnonzero(parts[mesh.topology.faces][:, :, k].any(1)) for k in range(6)]
-    return Obstacle(type(mesh)(mesh.topology, parts, tuple(faces_of)), vertices, margin=0.003)
+    return Obstacle(replace(mesh, parts=parts, part_faces=tuple(faces_of)), vertices, margin=0.003)
 
 
 @pytest.mark.parametrize(("radius", "centre"), [(0.04, 0.137), (0.065, 0.137)])

@@ -3,7 +3,7 @@
 import numpy as np
 from collision_shapes import collision, sheet
 
-from isp_assets.geometry.spread import keep_larger, spread
+from isp_assets.geometry.spread import fade_out, keep_larger, spread
 
 
 def _field(rings: int, decay: float = 0.9) -> np.ndarray:
@@ -35,6 +35,16 @@ def test_as_many_rings_follow_as_asked_for() -> None:
 def test_a_field_of_ones_is_kept_by_the_average() -> None:
     average = collision(sheet(6)).topology.neighbour_average
     np.testing.assert_allclose(average @ np.ones(36), 1.0)
+
+
+def test_shares_fade_in_a_straight_line_whatever_the_size_of_the_triangles() -> None:
+    for count in (21, 41):
+        vertices, faces = sheet(count)
+        edge = 0.2 / (count - 1)
+        share = np.where(vertices[:, 0] < -0.0999, 1.0, 0.0)
+        faded = fade_out(share, faces, reach=0.1, edge=edge)
+        np.testing.assert_allclose(faded, (-vertices[:, 0] / 0.1).clip(0, 1), atol=1e-9)
+        assert share.sum() == count
 
 
 def test_no_move_stays_no_move() -> None:

@@ -134,8 +134,8 @@ _MEAN_AND_MAX = {
     "strain_p99": "strain_p99",
 }
 _MAX = (
-    "body_unavoidable_max", "inner_unavoidable_max", "crossing_pairs", "deepest_mm", "flipped_percent", "jump_ratio",
-    "before_jump_ratio",
+    "body_unavoidable_max", "inner_unavoidable_max", "crossing_pairs", "deepest_mm",
+    "flipped_percent", "jump_ratio", "before_jump_ratio",
     "anchor_jump_ratio", "far_percent",
     "corrected_3cm", "corrected_mm", "difference_mm", "before_difference_mm",
 )  # fmt: skip

@@ -15,7 +15,7 @@ from isp_assets.motion import Motion
 from isp_assets.train.leg_ik import LEGS, Figure, Matrix, Point, Pose, sign, turn, vector
 from isp_assets.train.procedural_motion import squat
 
-FPS = 30
+FPS = 30.0
 _HANGING = 15.0  # degrees between a hanging arm and straight down
 _ELBOW = 12.0  # degrees that a hanging elbow is bent
 _WAIST_AHEAD = np.array([0.0, -0.02, 0.03])  # from the lowest spine joint to where a hand rests [m]

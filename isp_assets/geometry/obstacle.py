@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import (
     Closest,
