@@ -38,7 +38,7 @@ class Tucking:
             self._cover(garment, vertices, covers)
         self._hidden = tuple(reversed(hidden))
         self.worn = tuple(
-            replace(garment, stretch=garment.stretch.loosened(part.share > 0))
+            replace(garment, stretch=garment.stretch.loosened((part.share > 0).astype(float)))
             for garment, part in zip(worn, self._hidden, strict=True)
         )
         """The layers, free to crumple where they are hidden."""

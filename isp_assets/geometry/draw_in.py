@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _HALVINGS = 5
+_FURTHEST = 3.0  # a point goes so many times as far as it lies within the other part, at most
 _STEEPEST = 0.02  # beyond this height [m] the other part is out of sight
 
 
@@ -30,10 +31,12 @@ def draw_in(
             are clear; negative while they touch.
 
     Returns:
-        The moves [m]; and where they are enough. Where they are not, the moves take all the room:
-        the two parts press the cloth flat.
+        The moves [m]; and where they are enough. Where they are not, the moves take the room:
+        the two parts press the cloth flat. A light touch takes little of it, lest cloth jump.
     """
-    moves, rows = room[:, None] * inwards, np.arange(len(points))
+    rows = np.arange(len(points))
+    room = np.minimum(room, _FURTHEST * (-clearance(points, rows)).clip(0))
+    moves = room[:, None] * inwards
     above = clearance(points + moves, rows)
     clear = above >= 0
     rows = np.flatnonzero(clear)

@@ -35,7 +35,7 @@ from isp_assets.geometry.lifts import (
 from isp_assets.geometry.narrow import flatten
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.other_parts import Ways, leave_other_parts
-from isp_assets.geometry.spread import keep_larger, spread
+from isp_assets.geometry.spread import fade_out, keep_larger, spread
 from isp_assets.geometry.stretch import StretchLimit
 
 BODY_MARGIN = 0.003
@@ -46,6 +46,8 @@ LAYER_MARGIN = 0.0025
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
 _RIM_REACH = 0.015  # contact deeper than this [m] is left alone there
+_CRAMPED = 0.8  # share of its size to which cloth without room may shrink: stretched out, it would buckle
+_BESIDE = 0.12  # the same in part for cloth within this distance [m] of it
 _ORDER_REACH = 0.015  # a garment further beneath an inner one than this [m] cannot be put above it alone
 
 
@@ -121,10 +123,9 @@ def project(
     if not np.isfinite(start).all():
         raise GeometryError("garment positions hold NaN or infinity; check the networks' output")
     options = options or ProjectionOptions()
-    eased = start if stretch is None else stretch.ease(start, steps=options.ease)
     if parts is not None:
         mesh = replace(mesh, parts=parts)
-    work = _Projector(eased, mesh, obstacles, options, stretch)
+    work = _Projector(start, mesh, obstacles, options, stretch)
     rounds = work.lift()
     work.keep_order()
     crossings = work.finish()
@@ -145,7 +146,7 @@ class _Projector:
         stretch: StretchLimit | None,
     ) -> None:
         self.start = self.position = position
-        self.mesh, self.options, self.stretch = mesh, options, stretch
+        self.mesh, self.options = mesh, options
         self.near: list[Neighbour] = []
         """What lies beneath, the outermost layer first and the body last."""
         open_parts, edge = mesh.parts, mean_edge(position, mesh.topology.faces)
@@ -155,8 +156,17 @@ class _Projector:
             open_parts = open_beneath(open_parts, obstacle, found)
         self.tight: Bool[np.ndarray, " V"] = np.any([n.cramped for n in self.near], axis=0)
         self.narrow: Float[np.ndarray, " V"] = np.max([n.narrow for n in self.near], axis=0)
+        cramped = fade_out(self.narrow, mesh.topology.faces, reach=_BESIDE, edge=edge)
+        self.stretch = None if stretch is None else stretch.loosened(cramped, least=_CRAMPED)
         self.pressed = np.zeros(len(position), bool)
         """Vertices between two body parts: what lifts them off one drives them into the other."""
+        self.ease(steps=options.ease)
+        self.start = self.position
+
+    def ease(self, *, steps: int) -> None:
+        """Take back strain."""
+        if self.stretch is not None:
+            self._move(self.stretch.ease(self.position, steps=steps) - self.position)
 
     def lift(self) -> int:
         """Lift vertices, and triangles once most vertices are clear; the number of rounds taken."""
@@ -175,8 +185,7 @@ class _Projector:
             if last:
                 break
             self._move(flatten(self.position, self.mesh, np.maximum(self.narrow, self.pressed)))
-            if self.stretch is not None:
-                self._move(self.stretch.ease(self.position, steps=options.ease - 1) - self.position)
+            self.ease(steps=options.ease - 1)
         return options.rounds
 
     def keep_order(self) -> None:

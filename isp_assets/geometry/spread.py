@@ -38,16 +38,22 @@ def fade_out(
 def spread(
     move: Float[np.ndarray, "V 3"], neighbour_average: csr_array, *, rings: int, decay: float
 ) -> Float[np.ndarray, "V 3"]:
-    """Let neighbours follow: a screened Laplace equation, by Jacobi rounds; moved vertices keep their move.
+    """Let neighbours follow: a screened Laplace equation, by Jacobi rounds.
+
+    A vertex that is to move follows its neighbours too, and adds along its own move what that lacks.
+    So it makes no difference whether its own move is zero or very small.
 
     Args:
-        move: Moves [m]; rows that are exactly zero are free to follow.
+        move: Moves [m] that vertices must make at least.
         neighbour_average: Averages a field over the neighbours of each vertex.
         rings: Rounds, and so the number of rings that are reached.
         decay: Part of the neighbours' mean move that a vertex follows.
     """
-    held = (move != 0).any(1)
+    size = np.sqrt(np.einsum("vc,vc->v", move, move))
+    direction = move / np.maximum(size, 1e-12)[:, None]
     field = move
-    for _ in range(rings if held.any() else 0):
-        field = np.where(held[:, None], move, decay * (neighbour_average @ field))
+    for _ in range(rings if size.any() else 0):
+        followed = decay * (neighbour_average @ field)
+        lacking = (size - np.einsum("vc,vc->v", followed, direction)).clip(0)
+        field = followed + np.where(size > 0, lacking, 0)[:, None] * direction
     return field

@@ -77,10 +77,15 @@ class StretchLimit:
         least = np.full(len(faces), 1 - limit)
         return cls(faces, inverse, limit, least, gradient, weighted, inertia, solver)
 
-    def loosened(self, crumpled: Bool[np.ndarray, " V"], *, least: float = CRUMPLED) -> "StretchLimit":
-        """The same, with cloth at some vertices free to shrink to ``least`` of its size: to crumple."""
-        faces = crumpled[self.faces].any(axis=1)
-        return replace(self, least=np.where(faces, np.minimum(self.least, least), self.least))
+    def loosened(self, share: Float[np.ndarray, " V"], *, least: float = CRUMPLED) -> "StretchLimit":
+        """The same, with cloth free to shrink to ``least`` of its size: to crumple.
+
+        Args:
+            share: How far it may do so at each vertex, 0 to 1.
+            least: Share of its size that is left where it may wholly.
+        """
+        free = share[self.faces].max(axis=1)
+        return replace(self, least=self.least + free * np.minimum(least - self.least, 0))
 
     def ease(self, vertices: Float[np.ndarray, "V 3"], *, steps: int) -> Float[np.ndarray, "V 3"]:
         """Positions after some steps; the array that came in, if no face is strained beyond the limit."""
