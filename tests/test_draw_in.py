@@ -31,6 +31,24 @@ def test_without_enough_room_it_takes_what_there_is() -> None:
     np.testing.assert_allclose(moves, 0.01 * DOWN)
 
 
+def test_a_light_touch_moves_little_though_nothing_clears_it() -> None:
+    """Squeezed for good: what moves grows from nothing with how deep it lies, up to all the room."""
+
+    def squeezed(depth: float) -> float:
+        def clearance(points: np.ndarray, rows: np.ndarray) -> np.ndarray:
+            return np.full(len(points), -depth)
+
+        moves, clear = draw_in(np.zeros((1, 3)), DOWN, np.array([0.01]), clearance)
+        assert not clear.any()
+        return -moves[0, 1]
+
+    moved = [squeezed(depth) for depth in (1e-6, 1e-5, 0.001, 0.003, 0.02)]
+    assert moved[0] < 1e-5
+    assert moved[1] < 1e-4
+    assert (np.diff(moved) > 0).all()
+    assert moved[-1] == 0.01
+
+
 def test_points_are_judged_by_their_own_rows() -> None:
     levels, asked = np.array([-0.004, -0.5, -0.012]), []
 

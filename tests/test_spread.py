@@ -23,6 +23,25 @@ def test_moved_vertices_keep_their_move_and_neighbours_follow_less_and_less() ->
     assert 0 < row[1] < 0.01
 
 
+def test_a_very_small_move_of_its_own_holds_nothing_back() -> None:
+    """Whether a vertex beside a lifted one lies a hair within the margin or without makes no difference."""
+    shape = sheet(11)
+    average = collision(shape).topology.neighbour_average
+    fields = []
+    for own in (0.0, 1e-7):
+        move = np.zeros_like(shape[0])
+        move[60], move[61] = [0, 0.01, 0], [0, own, 0]
+        fields.append(spread(move, average, rings=8, decay=0.9))
+    np.testing.assert_allclose(fields[1], fields[0], atol=1e-6)
+
+
+def test_every_vertex_moves_at_least_as_far_as_it_must() -> None:
+    shape, rng = sheet(11), np.random.default_rng(3)
+    move = np.where(rng.random((121, 1)) < 0.3, rng.uniform(0, 0.01, (121, 1)), 0) * np.array([0, 1.0, 0])
+    field = spread(move, collision(shape).topology.neighbour_average, rings=8, decay=0.9)
+    assert (field[:, 1] >= move[:, 1] - 1e-12).all()
+
+
 def test_as_many_rings_follow_as_asked_for() -> None:
     reached = np.abs(np.subtract.outer(np.arange(11), [5])).reshape(11, 1)
     for rings in (0, 1, 3):

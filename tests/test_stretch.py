@@ -63,6 +63,8 @@ def test_crumpled_cloth_may_shrink_but_not_stretch() -> None:
     stretched = loose.ease(1.3 * _flat(), steps=400)
     np.testing.assert_allclose(np.ptp(stretched[:, 0]), 1.05 * 0.16, rtol=1e-3)
     beside = _limit().loosened((np.arange(COUNT**2) < COUNT).astype(float), least=0.75)  # one row of vertices
+    half = _limit().loosened(np.full(COUNT**2, 0.5), least=0.75)
+    np.testing.assert_allclose(half.least, (0.75 + _limit().least) / 2)
     assert (beside.least == 0.75).sum() == (FACES < COUNT).any(1).sum()
     assert beside.ease(shrunk, steps=1) is not shrunk
 

@@ -59,7 +59,7 @@ class ProjectionOptions:
     """Rounds of lifting; the last one does not spread."""
     ease: int = 2
     """Steps of easing stretched cloth before the first round; one less after every round but the last."""
-    finish: int = 4
+    finish: int = 2
     """Rounds of lifting triangles that still cross, at most."""
     spread: int = 8
     """Rings of neighbours that follow a lift."""
