@@ -20,7 +20,7 @@ from isp_assets.geometry.spread import fade_out
 
 _ARMS = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
 _ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is
-_FROM, _FULL = 0.005, 0.013  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
+_FROM, _FULL = 0.02, 0.035  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
 _FADE = 0.1  # distance [m] within which neighbouring cloth follows
 
 
