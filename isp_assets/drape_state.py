@@ -22,6 +22,7 @@ class ChunkState:
         self.skinned: list[Float[Tensor, "T V 3"]] = []
         """Every layer before it was displaced."""
         self.bodies: list[BodyObstacle] = []
+        """Per frame: the innermost of the obstacles, which alone knows its hidden skin."""
         self.obstacles: list[list[Obstacle]] = []
         """Per frame: the body, then every finished layer."""
         self.stages: dict[str, list[np.ndarray]] = {}

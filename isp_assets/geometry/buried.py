@@ -19,7 +19,7 @@ from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, me
 from isp_assets.geometry.spread import fade_out
 
 _ARMS = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
-_ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is
+_ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is; less depth hides nothing
 _FROM, _FULL = 0.02, 0.035  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
 _FADE = 0.1  # distance [m] within which neighbouring cloth follows
 
@@ -51,6 +51,7 @@ class BodyObstacle(Obstacle):
 
     @cached_property
     def blocked(self) -> Bool[np.ndarray, " V"]:
+        """Hidden skin: probing above it finds room, as far as it is from the skin that hides it."""
         return self.depth_in.max(axis=1) > _ABOVE
 
     @cached_property
