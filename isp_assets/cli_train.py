@@ -20,6 +20,7 @@ SeedOption = Annotated[int, typer.Option("--seed")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")]
 BodyOption = Annotated[str, typer.Option("--body", help='"default" or an SMPL .npz or .pkl file.')]
 DeviceOption = Annotated[str, typer.Option("--device", help="cpu or cuda.")]
+RateOption = Annotated[float, typer.Option("--rate", help="Peak learning rate.")]
 
 MotionsOption = Annotated[
     Path | None, typer.Option("--motions", help="Folder of further motions (AMASS-style .npz).")
@@ -27,6 +28,8 @@ MotionsOption = Annotated[
 HoldOutOption = Annotated[
     str, typer.Option("--hold-out", help="Motions kept for the test, separated by commas.")
 ]
+
+_NOISY_HOLD = 0.2  # share of a run at its peak rate: noisy losses want a long decay
 
 
 @dataset_app.command("make")
@@ -176,6 +179,7 @@ def drape(
     motions: MotionsOption = None,
     hold_out: HoldOutOption = "",
     garments: Annotated[int, typer.Option(help="Garments to learn from.")] = 60,
+    rate: RateOption = 1e-3,
 ) -> None:
     """Train a category's displacements on physics alone: CATEGORY.safetensors (Eq. 8)."""
     from dataclasses import replace
@@ -187,10 +191,11 @@ def drape(
     from isp_assets.train.poses import PoseSource
     from isp_assets.train.wardrobe import WardrobeOptions
 
-    run = replace(_run(minutes, steps, seed, resume, device), hold=0.2)  # noisy losses want a long decay
-    held_out = split_names(hold_out)
+    run = replace(_run(minutes, steps, seed, resume, device), hold=_NOISY_HOLD)
     options = DisplacementOptions(
-        wardrobe=WardrobeOptions(garments=garments), poses=PoseSource(motions, held_out=held_out)
+        wardrobe=WardrobeOptions(garments=garments),
+        poses=PoseSource(motions, held_out=split_names(hold_out)),
+        learning_rate=rate,
     )
     train_displacement(
         GarmentBundle.load(bundle), SkinBundle.load(skin), out, run, body=Body.load(body), options=options
@@ -223,7 +228,7 @@ def carry(
 
 
 @train_app.command("layering")
-def layering(
+def layering_network(
     bundles: Annotated[
         list[Path], typer.Option("--bundle", help="Garment bundle with displacements; repeat.")
     ],
@@ -237,18 +242,27 @@ def layering(
     body: BodyOption = "default",
     motions: MotionsOption = None,
     hold_out: HoldOutOption = "",
+    layering: Annotated[
+        Path | None, typer.Option("--layering", help="A layering bundle to train further.")
+    ] = None,
+    rate: RateOption = 1e-3,
 ) -> None:
     """Train the layering network on random stacks of all bundles: layering.safetensors (Eqs. 9-12)."""
+    from dataclasses import replace
+
     from isp_assets.body import Body
-    from isp_assets.bundle import GarmentBundle, SkinBundle
+    from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
     from isp_assets.pipeline import split_names
     from isp_assets.train.layering import LayeringOptions, train_layering
     from isp_assets.train.poses import PoseSource
 
-    run = _run(minutes, steps, seed, resume, device)
-    options = LayeringOptions(poses=PoseSource(motions, held_out=split_names(hold_out)))
+    run = replace(_run(minutes, steps, seed, resume, device), hold=_NOISY_HOLD)
+    options = LayeringOptions(poses=PoseSource(motions, held_out=split_names(hold_out)), learning_rate=rate)
     garments = [GarmentBundle.load(bundle) for bundle in bundles]
-    train_layering(garments, SkinBundle.load(skin), out, run, body=Body.load(body), options=options)
+    earlier = LayeringBundle.load(layering) if layering else None
+    train_layering(
+        garments, SkinBundle.load(skin), out, run, body=Body.load(body), options=options, earlier=earlier
+    )
 
 
 def _run(minutes: float | None, steps: int | None, seed: int, resume: bool, device: str) -> "RunOptions":

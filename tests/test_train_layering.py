@@ -14,11 +14,12 @@ from isp_assets.body import Body
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import clearance
+from isp_assets.geometry.obstacle import BODY_PARTS
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.train import wardrobe
-from isp_assets.train.layering import LayeringOptions, LayeringTask, train_layering
+from isp_assets.train.layering import LayeringOptions, LayeringTask, _limbs, train_layering
 from isp_assets.train.loop import RunOptions, train
 
 OPTIONS = LayeringOptions(
@@ -125,6 +126,50 @@ def test_trained_bundle_is_written_with_figures_and_provenance(
     assert loaded.provenance["config"]["categories"] == ["pillow"]
     assert dict(loaded.metrics) == dict(result.metrics)
     assert {"before.layer_area_percent", "after.layer_area_percent"} <= set(loaded.metrics)
+
+
+def test_training_goes_on_from_an_earlier_network_and_says_so(
+    bundle: GarmentBundle, skin: SkinBundle, body: Body, tmp_path: Path
+) -> None:
+    first = train_layering(
+        [bundle], skin, tmp_path / "first", RunOptions(steps=2), body=body, options=OPTIONS, stacks=1
+    )
+    wider = replace(OPTIONS, network=replace(OPTIONS.network, features=8))  # an earlier one keeps its size
+    task = LayeringTask([bundle], skin, body, wider, earlier=first)
+    weights = task.module.state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in first.layering_net.state_dict().items())
+    # Contact is stiff from the start: progress changes nothing.
+    generators = [torch.Generator().manual_seed(1) for _ in range(2)]
+    early, late = (task.losses(g, p) for g, p in zip(generators, (0.0, 1.0), strict=True))
+    assert all(torch.equal(early[name], late[name]) for name in early)
+    second = train_layering(
+        [bundle], skin, tmp_path / "second", RunOptions(steps=1), body=body, options=wider, earlier=first,
+        stacks=1,
+    )  # fmt: skip
+    assert second.layering_net.config == OPTIONS.network
+    assert second.provenance["earlier"] == dict(first.provenance)
+
+
+def test_stacks_have_two_to_five_layers_in_the_given_shares(task: LayeringTask) -> None:
+    only = copy(task)
+    for depth in (2, 5):
+        only.options = replace(OPTIONS, depth_shares=tuple(float(n == depth) for n in range(2, 6)))
+        stack = only.stack(
+            only.wearers, torch.zeros(1, 24, 3), torch.zeros(10), torch.Generator().manual_seed(3)
+        )
+        assert len(stack.inner) == depth - 1
+        assert len(stack.beneath) == depth
+
+
+def test_cloth_between_an_arm_and_the_torso_is_drawn_home_but_between_thigh_and_belly_pushed_out() -> None:
+    parts = list(BODY_PARTS)
+    one_hot = torch.eye(len(parts), dtype=torch.bool)
+    limbs = _limbs(one_hot)
+    assert limbs.shape == (len(parts), 3)
+    assert (limbs.sum(1) == 1).all()
+    group = dict(zip(parts, limbs.float().argmax(1).tolist(), strict=True))
+    assert group["torso"] == group["left_leg"] == group["right_leg"] == group["head"]
+    assert len({group["torso"], group["left_arm"], group["right_arm"]}) == 3
 
 
 def test_what_does_not_belong_together_is_refused(

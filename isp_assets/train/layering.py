@@ -1,6 +1,6 @@
 """Train the layering network D_m on random stacks of garments, from physics alone (Eqs. 10-12).
 
-A step draws two or three garments of all categories, drapes them independently on one
+A step draws two to five garments of all categories, drapes them independently on one
 body shape in some poses, makes the inner ones final, and corrects the outermost with the
 network. No example is needed: the network learns to lower the garment's energy, which
 holds the contact with the body and with every inner garment.
@@ -10,12 +10,12 @@ Implicit Sewing Patterns", NeurIPS 2023, Section 3.2, Eqs. 10-12.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from isp_assets.body import Body, PosedBody
@@ -24,11 +24,12 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
+from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, body_parts
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.skinning import shape_garment
+from isp_assets.train.body_contact import PartedBody
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
@@ -61,10 +62,10 @@ class LayeringOptions:
     """Weight of the mean square displacement, in units of the network (lambda_r of Eq. 11)."""
     frames: int = 2
     """Poses a step."""
-    deep_share: float = 0.5
-    """Share of the stacks that have three layers."""
+    depth_shares: tuple[float, ...] = (0.4, 0.3, 0.2, 0.1)
+    """Shares of the stacks that have 2, 3, 4 and 5 layers."""
     learning_rate: float = 1e-3
-    optimizer: OptimizerName = "adam"
+    optimizer: OptimizerName = "soap"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,23 +88,30 @@ class LayeringTask:
 
     def __init__(
         self, bundles: Sequence[GarmentBundle], skin: SkinBundle, body: Body, options: LayeringOptions, *,
-        device: str = "cpu", seed: int = 0,
+        earlier: LayeringBundle | None = None, device: str = "cpu", seed: int = 0,
     ) -> None:  # fmt: skip
         torch.manual_seed(seed)
-        self.name = "layering"
+        self.name, self.is_further = "layering", earlier is not None
+        if earlier is not None:
+            options = replace(options, network=earlier.layering_net.config)
         self.config: Mapping[str, Any] = {
-            "network": options.network.to_dict(), "contact": asdict(options.contact), "body": body.sha256,
+            "network": options.network.to_dict(), "further": self.is_further,
+            "contact": asdict(options.contact), "body": body.sha256,
             "categories": [bundle.category for bundle in bundles], "garments": options.garments,
             "held_out": [options.held_out, *options.poses.held_out], "frames": options.frames,
             "layer_weight": options.layer_weight, "regular_weight": options.regular_weight,
-            "deep_share": options.deep_share, "learning_rate": options.learning_rate,
+            "depth_shares": list(options.depth_shares), "learning_rate": options.learning_rate,
             "optimizer": options.optimizer,
         }  # fmt: skip
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.optimizer = options.optimizer
         self.body = body.to(self.device)
         self.body_collision = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
-        self.module = LayeringNet(options.network).to(self.device)
+        self.body_limbs = _limbs(torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])).to(self.device)
+        self.module = LayeringNet(options.network)
+        if earlier is not None:
+            self.module.load_state_dict(earlier.layering_net.state_dict())
+        self.module.to(self.device)
         wardrobe = WardrobeOptions(
             garments=options.garments, edge_length=options.edge_length, map_size=options.network.map_size
         )
@@ -125,7 +133,9 @@ class LayeringTask:
         lifted, _ = correct_layer(
             stack.wearer.layering, stack.draped, stack.beneath, stack.posed, ramp=stack.wearer.ramp
         )
-        return self._scaled(stack, lifted, self.options.contact.at(progress))
+        # What is trained further must not sink into what lies beneath it first.
+        stiffness = self.options.contact.at(1.0 if self.is_further else progress)
+        return self._scaled(stack, lifted, stiffness)
 
     @torch.no_grad()
     def stack(
@@ -138,7 +148,8 @@ class LayeringTask:
         """Drape a random stack, innermost first, and make all but the outermost garment final."""
         posed = self.body.pose(poses.to(self.device), betas=betas.to(self.device))
         beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
-        depth = 3 if float(torch.rand((), generator=generator)) < self.options.deep_share else 2
+        shares = torch.tensor(self.options.depth_shares)
+        depth = 2 + int(torch.multinomial(shares, 1, generator=generator))
         chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (depth,), generator=generator)]
         skin = [Obstacle(self.body_collision, v, margin=0.0) for v in posed.vertices.cpu().numpy()]
         layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen], skin)
@@ -156,7 +167,8 @@ class LayeringTask:
         options, contact = self.options, self.options.contact
         bound = stack.wearer.bound
         rest = graded_rest(stack.wearer.rest, bound.canonical, shape_garment(bound, stack.betas))
-        height = clearance(vertices, stack.beneath[0])
+        skin = PartedBody.of(stack.beneath[0], self.body_limbs)
+        height = skin.clearance(vertices, _limbs(stack.wearer.parts), margin=contact.margin)
         terms = drape_energies(vertices, height, rest, self.fabric, contact, stiffness=stiffness)
         layers = vertices.new_zeros(len(vertices))
         for surface in stack.beneath[1:]:
@@ -201,6 +213,13 @@ class LayeringTask:
         return {name: float(sum(row[name] for row in rows) / len(rows)) for name in rows[0]}
 
 
+def _limbs(parts: Bool[Tensor, "P 6"]) -> Bool[Tensor, "P 3"]:
+    """`BODY_PARTS` as arms and the rest: cloth in the crease of a hip may leave it either way."""
+    arms = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
+    rest = [index for index in range(len(BODY_PARTS)) if index not in arms]
+    return torch.cat([parts[:, rest].any(1, keepdim=True), parts[:, arms]], dim=1)
+
+
 def _tucked(
     wearers: Sequence[Wearer], layers: list[Float[Tensor, "T _ 3"]], skin: Sequence[Obstacle]
 ) -> list[Float[Tensor, "T _ 3"]]:
@@ -217,7 +236,8 @@ def _tucked(
 
 def train_layering(
     bundles: Sequence[GarmentBundle], skin: SkinBundle, out: Path, run: RunOptions, *,
-    body: Body, options: LayeringOptions | None = None, stacks: int = 24,
+    body: Body, options: LayeringOptions | None = None, earlier: LayeringBundle | None = None,
+    stacks: int = 24,
 ) -> LayeringBundle:  # fmt: skip
     """Train D_m and write ``layering.safetensors`` into ``out``.
 
@@ -228,6 +248,7 @@ def train_layering(
         run: How long and where.
         body: The body that all were trained on.
         options: What to train on.
+        earlier: A network to train further, with contact at its full stiffness from the start.
         stacks: Held-out stacks that the final metrics are taken on.
 
     Raises:
@@ -244,14 +265,14 @@ def train_layering(
                 "give the body that all were trained on"
             )
     options = options or LayeringOptions()
-    task = LayeringTask(bundles, skin, body, options, device=run.device, seed=run.seed)
+    task = LayeringTask(bundles, skin, body, options, earlier=earlier, device=run.device, seed=run.seed)
     report = train(task, out, run)
     metrics = task.measure_on(stacks=stacks)
     result = LayeringBundle(
         task.module.cpu().eval().requires_grad_(False),
         provenance={
             "steps": report.steps, "seconds": report.seconds, "device": report.device, "seed": run.seed,
-            "config": dict(task.config),
+            "config": dict(task.config), **({"earlier": dict(earlier.provenance)} if earlier else {}),
         },
         metrics=metrics,
     )  # fmt: skip

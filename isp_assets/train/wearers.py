@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from isp_assets.body import Body, PosedBody
@@ -35,6 +35,8 @@ class Wearer:
     rest: ClothRest
     code: Float[Tensor, " Z"]
     ramp: Float[Tensor, " V"]
+    parts: Bool[Tensor, "V 6"]
+    """Which of `BODY_PARTS` each vertex belongs to."""
     field: DrapeField | None
     displacement: BoundDisplacement | None
     layering: BoundLayering
@@ -79,6 +81,7 @@ def build_wearers(
                 rest=sample.rest.to(device),
                 code=sample.code.to(device),
                 ramp=sample.ramp[:, 0].to(device),
+                parts=sample.parts.to(device),
                 field=field,
                 displacement=displacement,
                 layering=bind_layering(network, sample.garment, sample.sampler, device=device),
