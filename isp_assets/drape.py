@@ -169,7 +169,6 @@ class Draper:
         state.beneath = [Surface.of_mesh(posed.vertices, self.body.faces)]
         margin = self.options.body_margin
         state.bodies = [BodyObstacle(self.body_collision, v, margin=margin) for v in skin]
-        state.obstacles = [[body] for body in state.bodies]
         alone = [self._drape_alone(worn, posed, state) for worn in self.worn]
         self._tuck(alone, state)
         layers = tuple(self._settle(index, vertices, posed, state) for index, vertices in enumerate(alone))
@@ -206,9 +205,9 @@ class Draper:
         if self.tucking is not None:
             with state.timed("tuck"):
                 layers[:] = [vertices.clone() for vertices in layers]
-                for t, beneath in enumerate(state.obstacles):
+                for t, body in enumerate(state.bodies):
                     before = [vertices[t].cpu().numpy().astype(np.float64) for vertices in layers]
-                    for index, after in enumerate(self.tucking.frame(before, beneath[0])):
+                    for index, after in enumerate(self.tucking.frame(before, body)):
                         if after is not before[index]:
                             layers[index][t] = torch.as_tensor(after).to(layers[index])
                             state.steps[index][t].append("tuck")
@@ -229,21 +228,24 @@ class Draper:
             note(ran, "layering", touched)
         state.keep("layering", vertices, keep)
         result = vertices.cpu().numpy()
-        tight: list[np.ndarray] | None = None
+        tight: list[np.ndarray | None] = [None] * len(result)
         if "project" in steps:
             with state.timed("project"):
                 result, tight = self._clear(index, vertices, posed, state)
         outside = torch.as_tensor(result, device=vertices.device)
         state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
-        for t, obstacles in enumerate(state.obstacles):
-            found = tight[t] if tight is not None else None
-            margin = self.options.layer_margin
-            obstacles.append(Obstacle(worn.collision, result[t], margin=margin, tight=found))
+        margin = self.options.layer_margin
+        state.finished.append(
+            [
+                Obstacle(worn.collision, frame, margin=margin, tight=found)
+                for frame, found in zip(result, tight, strict=True)
+            ]
+        )
         return result
 
     def _clear(
         self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: ChunkState
-    ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray]]:
+    ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray | None]]:
         """Projected vertices, and per frame which of them have no room."""
         worn, home = self.worn[index], self.homes[index]
         before, skinned = (part.cpu().double().numpy() for part in (vertices, state.skinned[index]))
@@ -252,14 +254,15 @@ class Draper:
             lay_on_skin(frame, own, worn.collision, home, body, gap=gap)
             for frame, own, body in zip(before, skinned, state.bodies, strict=True)
         ]
-        cleared = clear_layer(worn, laid, state.obstacles, self.options.projection)
+        obstacles = state.obstacles
+        cleared = clear_layer(worn, laid, obstacles, self.options.projection)
         for done, ran in zip(cleared, state.steps[index], strict=True):
             if done.ran:
                 ran.append("project")
         result = np.stack([done.vertices for done in cleared])
         if self.options.smoothing:
             turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
-            result = self.calm[index].follow(worn, laid, cleared, state.obstacles, turns)
+            result = self.calm[index].follow(worn, laid, cleared, obstacles, turns)
         return result.astype(np.float32), [done.tight for done in cleared]
 
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:

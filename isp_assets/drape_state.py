@@ -22,12 +22,17 @@ class ChunkState:
         self.skinned: list[Float[Tensor, "T V 3"]] = []
         """Every layer before it was displaced."""
         self.bodies: list[BodyObstacle] = []
-        """Per frame: the innermost of the obstacles, which alone knows its hidden skin."""
-        self.obstacles: list[list[Obstacle]] = []
-        """Per frame: the body, then every finished layer."""
+        """Per frame: what lies beneath all layers."""
+        self.finished: list[list[Obstacle]] = []
+        """Per finished layer and frame."""
         self.stages: dict[str, list[np.ndarray]] = {}
         self.steps: list[list[list[str]]] = []
         """Per layer and frame: names of the rungs that ran."""
+
+    @property
+    def obstacles(self) -> list[list[Obstacle]]:
+        """Per frame: the body, then every finished layer."""
+        return [list(frame) for frame in zip(self.bodies, *self.finished, strict=True)]
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:

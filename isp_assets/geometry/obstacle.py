@@ -46,7 +46,12 @@ def body_parts(
     joint_weights: Float[np.ndarray, "V 24"],
 ) -> tuple[Bool[np.ndarray, "V 6"], Bool[np.ndarray, "V 6"]]:
     """Which of `BODY_PARTS` each vertex belongs to, at least one; and which it may touch as its own."""
-    weight = _part_weights(joint_weights)
+    return _by_weight(_part_weights(joint_weights))
+
+
+def _by_weight(
+    weight: Float[np.ndarray, "V 6"],
+) -> tuple[Bool[np.ndarray, "V 6"], Bool[np.ndarray, "V 6"]]:
     parts = weight >= _BELONGS
     parts[np.arange(len(parts)), weight.argmax(1)] = True
     return parts, weight >= _EXTENDS
@@ -93,11 +98,12 @@ class CollisionMesh:
         Raises:
             GeometryError: If the mesh is no surface.
         """
-        parts, extended = body_parts(joint_weights)
+        weight = _part_weights(joint_weights)
+        parts, extended = _by_weight(weight)
         topology = SurfaceTopology.build(faces, len(joint_weights))
         of_face = extended[topology.faces].any(1)
         part_faces = tuple(np.flatnonzero(of_face[:, k]) for k in range(len(BODY_PARTS)))
-        return cls(topology, parts, part_faces, _part_weights(joint_weights).argmax(1))
+        return cls(topology, parts, part_faces, weight.argmax(1))
 
 
 class Obstacle:
