@@ -149,13 +149,14 @@ def test_nobody_buries_skin_in_a_walk_and_arms_in_the_torso_do() -> None:
 
 
 @pytest.mark.parametrize("garment", ["tee", "long_sleeved_shirt"])
-def test_arms_ten_degrees_into_the_torso_leave_no_cloth_in_the_body(garment: str) -> None:
+def test_arms_twenty_degrees_into_the_torso_leave_no_cloth_in_the_body(garment: str) -> None:
     body = Body.load("default")
-    shot = Shot("arms", body, arms_swept(Figure.of(body), [-10.0]))
+    shot = Shot("arms", body, arms_swept(Figure.of(body), [-20.0]))
     frames = drape(Collection.load().outfit([garment]), shot, DrapeOptions(resolution=64, keep_stages=True))
     chunk = next(iter(frames))
     found = FrameMeter(frames.scene).measure(chunk, 0, stages=True)
     name = frames.scene.layers[0].name
-    assert found[f"displace/{name}/body_area_percent"] > 1
+    # Projection alone leaves 1.3 and .18 % there.
+    assert found[f"displace/{name}/body_area_percent"] > 0.4
     assert found[f"final/{name}/body_area_percent"] < 0.1
-    assert found[f"final/{name}/strain_p99"] < 0.3
+    assert found[f"final/{name}/strain_p99"] < 0.32
