@@ -161,7 +161,7 @@ def test_stacks_have_two_to_five_layers_in_the_given_shares(task: LayeringTask) 
         assert len(stack.beneath) == depth
 
 
-def test_cloth_between_an_arm_and_the_torso_is_drawn_home_but_between_thigh_and_belly_pushed_out() -> None:
+def test_arms_are_limbs_of_their_own_and_legs_belong_to_the_rest() -> None:
     parts = list(BODY_PARTS)
     one_hot = torch.eye(len(parts), dtype=torch.bool)
     limbs = _limbs(one_hot)

@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from isp_assets.geometry.closest import ClosestQuery
-from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, mean_edge
+from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import fade_out
 
-_ARMS = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
 _ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is; less depth hides nothing
 _FROM, _FULL = 0.02, 0.035  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
 _FADE = 0.1  # distance [m] within which neighbouring cloth follows
@@ -60,8 +59,8 @@ class BodyObstacle(Obstacle):
 
         Thighs against the belly do not count: cloth spans that crease, and fares better in it.
         """
-        of_arm = np.isin(self.mesh.main_part, _ARMS)
-        return np.where(of_arm, self.depth_in.max(axis=1), self.depth_in[:, _ARMS].max(axis=1))
+        of_arm = np.isin(self.mesh.main_part, ARMS)
+        return np.where(of_arm, self.depth_in.max(axis=1), self.depth_in[:, list(ARMS)].max(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

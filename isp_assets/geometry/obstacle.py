@@ -33,6 +33,8 @@ BODY_PARTS: dict[str, tuple[int, ...]] = {
     "right_leg": (2, 5, 8, 11),
 }
 """Joints of each part."""
+ARMS = tuple(list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm"))
+"""Places of the arms among the parts."""
 
 NO_ROOM = 0.005
 """Surfaces this near to one another [m] leave no room for cloth between them."""

@@ -24,7 +24,7 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import BODY_PARTS, CollisionMesh, Obstacle, body_parts
+from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, CollisionMesh, Obstacle, body_parts
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
@@ -215,9 +215,8 @@ class LayeringTask:
 
 def _limbs(parts: Bool[Tensor, "P 6"]) -> Bool[Tensor, "P 3"]:
     """`BODY_PARTS` as arms and the rest: cloth in the crease of a hip may leave it either way."""
-    arms = [list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm")]
-    rest = [index for index in range(len(BODY_PARTS)) if index not in arms]
-    return torch.cat([parts[:, rest].any(1, keepdim=True), parts[:, arms]], dim=1)
+    rest = [index for index in range(len(BODY_PARTS)) if index not in ARMS]
+    return torch.cat([parts[:, rest].any(1, keepdim=True), parts[:, list(ARMS)]], dim=1)
 
 
 def _tucked(
