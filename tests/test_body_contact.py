@@ -7,7 +7,7 @@ from torch import Tensor
 
 from isp_assets.geometry.contact import Surface, clearance
 from isp_assets.geometry.obstacle import BODY_PARTS, body_parts
-from isp_assets.train.body_contact import PartedBody
+from isp_assets.train.body_contact import PartedBody, arms_and_rest
 
 MARGIN = 0.005
 
@@ -111,3 +111,14 @@ def test_parts_of_skinning_weights() -> None:
     assert parts[:, arm].tolist() == [False, False, True]
     assert extended[:, arm].tolist() == [False, True, True]
     assert parts.sum() == 4
+
+
+def test_arms_are_limbs_of_their_own_and_legs_belong_to_the_rest() -> None:
+    parts = list(BODY_PARTS)
+    one_hot = torch.eye(len(parts), dtype=torch.bool)
+    limbs = arms_and_rest(one_hot)
+    assert limbs.shape == (len(parts), 3)
+    assert (limbs.sum(1) == 1).all()
+    group = dict(zip(parts, limbs.float().argmax(1).tolist(), strict=True))
+    assert group["torso"] == group["left_leg"] == group["right_leg"] == group["head"]
+    assert len({group["torso"], group["left_arm"], group["right_arm"]}) == 3

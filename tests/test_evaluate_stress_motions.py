@@ -85,6 +85,19 @@ def test_squats_have_their_depth_with_the_feet_where_they_were(body, figure):
     np.testing.assert_allclose(np.ptp(joints["left_ankle"], axis=0), 0, atol=2e-3)
 
 
+def test_deep_squats_have_knees_over_toes_and_hips_that_bend_no_further_than_a_body_can(body, figure):
+    motion = motions.deep_squat(figure, [20.0, 40.0, 65.0])
+    joints = joints_of(body, motion)
+
+    def apart(name):
+        return joints[f"left_{name}"][:, 0] - joints[f"right_{name}"][:, 0]
+
+    assert (apart("knee") > apart("ankle")).all()
+    for side in ("left", "right"):
+        flexion = np.degrees(np.linalg.norm(motion.poses[:, JOINT_NAMES.index(f"{side}_hip")], axis=1))
+        assert flexion.max() < 155
+
+
 @pytest.mark.parametrize(("rule", "axis"), [(motions.stride, 2), (motions.split, 0)])
 def test_legs_have_their_angle_and_straight_knees(body, figure, rule, axis):
     angles = [0.0, 45.0, 90.0]

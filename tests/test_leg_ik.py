@@ -22,8 +22,8 @@ def figure(body):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.sampled_from(["left", "right"]), st.integers(0, 10**6))
-def test_ankle_and_foot_arrive_where_they_should(body, figure, side, seed):
+@given(st.sampled_from(["left", "right"]), st.booleans(), st.integers(0, 10**6))
+def test_ankle_and_foot_arrive_where_they_should(body, figure, side, aimed, seed):
     rng = np.random.default_rng(seed)
     root = Rotation.from_rotvec(0.4 * rng.normal(size=3)).as_matrix()
     foot = Rotation.from_rotvec(0.4 * rng.normal(size=3)).as_matrix()
@@ -34,13 +34,19 @@ def test_ankle_and_foot_arrive_where_they_should(body, figure, side, seed):
     socket = pelvis + root @ (figure.joints[hip] - figure.joints[0])
     target = socket + reach * direction / np.linalg.norm(direction)
     pose = np.zeros((24, 3))
-    bend_leg(figure, side, pose, (pelvis, root), (target, foot))
+    goal = target + np.array([0.2 * rng.normal(), 0.4, 0.3]) if aimed else None
+    bend_leg(figure, side, pose, (pelvis, root), (target, foot), knee_towards=goal)
     pose[0] = Rotation.from_matrix(root).as_rotvec()
     translation = torch.from_numpy(pelvis - figure.joints[0]).float()[None]
     posed = body.pose(torch.from_numpy(pose).float()[None], translation=translation)
     np.testing.assert_allclose(posed.joints[0, ankle], target, atol=1e-5)
     np.testing.assert_allclose(posed.joint_transforms[0, ankle, :3, :3], foot, atol=1e-5)
     assert pose[knee, 0] > 0, "a knee bends one way"
+    if aimed:
+        axis = (target - socket) / reach
+        thigh = posed.joints[0, knee].double().numpy() - socket
+        bent, asked = (v - (v @ axis) * axis for v in (thigh, goal - socket))
+        np.testing.assert_allclose(bent / np.linalg.norm(bent), asked / np.linalg.norm(asked), atol=1e-3)
 
 
 def test_target_out_of_reach_gives_an_almost_straight_leg(figure):

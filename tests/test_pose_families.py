@@ -80,3 +80,9 @@ def test_random_turns_are_even_over_all_rotations() -> None:
     up = axis_angle_to_matrix(turns)[:, :, 1]
     np.testing.assert_allclose(up.mean(0), 0, atol=0.015)  # the image of an axis is even on the sphere
     np.testing.assert_allclose(up.T @ up / len(up), np.eye(3) / 3, atol=0.01)
+
+
+def test_squats_have_their_knees_apart() -> None:
+    posed = Body.load().pose(_draw(NAMED["squat"], 200))
+    apart = posed.joints[:, _joint("left_knee"), 0] - posed.joints[:, _joint("right_knee"), 0]
+    assert (apart > 0.05).float().mean() > 0.9

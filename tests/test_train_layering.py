@@ -14,12 +14,11 @@ from isp_assets.body import Body
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import clearance
-from isp_assets.geometry.obstacle import BODY_PARTS
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.train import wardrobe
-from isp_assets.train.layering import LayeringOptions, LayeringTask, _limbs, train_layering
+from isp_assets.train.layering import LayeringOptions, LayeringTask, train_layering
 from isp_assets.train.loop import RunOptions, train
 
 OPTIONS = LayeringOptions(
@@ -159,17 +158,6 @@ def test_stacks_have_two_to_five_layers_in_the_given_shares(task: LayeringTask) 
         )
         assert len(stack.inner) == depth - 1
         assert len(stack.beneath) == depth
-
-
-def test_arms_are_limbs_of_their_own_and_legs_belong_to_the_rest() -> None:
-    parts = list(BODY_PARTS)
-    one_hot = torch.eye(len(parts), dtype=torch.bool)
-    limbs = _limbs(one_hot)
-    assert limbs.shape == (len(parts), 3)
-    assert (limbs.sum(1) == 1).all()
-    group = dict(zip(parts, limbs.float().argmax(1).tolist(), strict=True))
-    assert group["torso"] == group["left_leg"] == group["right_leg"] == group["head"]
-    assert len({group["torso"], group["left_arm"], group["right_arm"]}) == 3
 
 
 def test_what_does_not_belong_together_is_refused(

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from isp_assets.geometry.contact import Surface, clearance
+from isp_assets.geometry.obstacle import ARMS, BODY_PARTS
 
 _SAME = 1e-6  # two clearances closer than this [m] are from one sample
 
@@ -68,6 +69,12 @@ class PartedBody:
             height, known = clearance(vertices[:, rows], part), best[:, rows]
             best = best.index_copy(1, rows, torch.where(height.abs() < known.abs(), height, known))
         return best
+
+
+def arms_and_rest(parts: Bool[Tensor, "P 6"]) -> Bool[Tensor, "P 3"]:
+    """`BODY_PARTS` as arms and the rest: cloth in the crease of a hip may leave it either way."""
+    rest = [index for index in range(len(BODY_PARTS)) if index not in ARMS]
+    return torch.cat([parts[:, rest].any(1, keepdim=True), parts[:, list(ARMS)]], dim=1)
 
 
 def _cut(whole: Surface, index: Int[Tensor, " n"]) -> Surface:

@@ -30,7 +30,7 @@ from isp_assets.geometry.obstacle import body_parts
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.networks.placement import on_device
 from isp_assets.skinning import shape_garment, skin_garment
-from isp_assets.train.body_contact import PartedBody
+from isp_assets.train.body_contact import PartedBody, arms_and_rest
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
@@ -93,7 +93,8 @@ class DisplacementTask:
         self.optimizer = options.optimizer
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
-        self.body_parts = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1]).to(self.device)
+        members = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])
+        self.body_limbs = arms_and_rest(members).to(self.device)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)
         skin_field = on_device(skin.skin_field, self.device)
         samples = build_wardrobe(bundle, self.body, skin_field, wardrobe, seed=seed)
@@ -135,7 +136,7 @@ class DisplacementTask:
         with torch.no_grad():
             betas = betas.to(self.device)
             posed = self.body.pose(poses.to(self.device), betas=betas)
-            skin = PartedBody.of(Surface.of_mesh(posed.vertices, self.body.faces), self.body_parts)
+            skin = PartedBody.of(Surface.of_mesh(posed.vertices, self.body.faces), self.body_limbs)
             return PosedBatch(betas, posed, skin)
 
     def drape(
@@ -166,7 +167,7 @@ class DisplacementTask:
         self, sample: WornSample, skinned: Tensor, vertices: Tensor, batch: PosedBatch, stiffness: float
     ) -> dict[str, Tensor]:
         case = self.case(sample, batch)
-        height = batch.skin.clearance(vertices, sample.parts, margin=case.contact.margin)
+        height = batch.skin.clearance(vertices, arms_and_rest(sample.parts), margin=case.contact.margin)
         terms = drape_energies(vertices, height, case.rest, self.fabric, case.contact, stiffness=stiffness)
         reference = reference_energy(case.rest)
         present = sum(value.detach() for name, value in terms.items() if name != "gravity")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import Body, PosedBody
@@ -24,12 +24,12 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, CollisionMesh, Obstacle, body_parts
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, body_parts
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.skinning import shape_garment
-from isp_assets.train.body_contact import PartedBody
+from isp_assets.train.body_contact import PartedBody, arms_and_rest
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
@@ -107,7 +107,8 @@ class LayeringTask:
         self.optimizer = options.optimizer
         self.body = body.to(self.device)
         self.body_collision = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
-        self.body_limbs = _limbs(torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])).to(self.device)
+        members = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])
+        self.body_limbs = arms_and_rest(members).to(self.device)
         self.module = LayeringNet(options.network)
         if earlier is not None:
             self.module.load_state_dict(earlier.layering_net.state_dict())
@@ -168,7 +169,7 @@ class LayeringTask:
         bound = stack.wearer.bound
         rest = graded_rest(stack.wearer.rest, bound.canonical, shape_garment(bound, stack.betas))
         skin = PartedBody.of(stack.beneath[0], self.body_limbs)
-        height = skin.clearance(vertices, _limbs(stack.wearer.parts), margin=contact.margin)
+        height = skin.clearance(vertices, arms_and_rest(stack.wearer.parts), margin=contact.margin)
         terms = drape_energies(vertices, height, rest, self.fabric, contact, stiffness=stiffness)
         layers = vertices.new_zeros(len(vertices))
         for surface in stack.beneath[1:]:
@@ -211,12 +212,6 @@ class LayeringTask:
             )
             rows.append(measure_layering(stack, lifted, self.body))
         return {name: float(sum(row[name] for row in rows) / len(rows)) for name in rows[0]}
-
-
-def _limbs(parts: Bool[Tensor, "P 6"]) -> Bool[Tensor, "P 3"]:
-    """`BODY_PARTS` as arms and the rest: cloth in the crease of a hip may leave it either way."""
-    rest = [index for index in range(len(BODY_PARTS)) if index not in ARMS]
-    return torch.cat([parts[:, rest].any(1, keepdim=True), parts[:, list(ARMS)]], dim=1)
 
 
 def _tucked(

@@ -77,19 +77,36 @@ def ankle_of(figure: Figure, side: str, foot: FootPlacement) -> tuple[Point, Mat
 
 
 def bend_leg(
-    figure: Figure, side: str, pose: Pose, pelvis: tuple[Point, Matrix], ankle: tuple[Point, Matrix]
+    figure: Figure,
+    side: str,
+    pose: Pose,
+    pelvis: tuple[Point, Matrix],
+    ankle: tuple[Point, Matrix],
+    *,
+    knee_towards: Point | None = None,
 ) -> None:
     """Set hip, knee and ankle so that the ankle joint and the foot are where they should be.
 
     The knee turns about x alone, by the angle that gives the leg the right length
-    ``|thigh + R_x shin|``; the hip then points the leg at the target by the smallest rotation.
+    ``|thigh + R_x shin|``; the hip then points the leg at the target by the smallest rotation,
+    and turns it about the line from hip to ankle if the knee is to point somewhere.
+
+    Args:
+        figure: The body at rest.
+        side: ``"left"`` or ``"right"``.
+        pose: Takes the rotations.
+        pelvis: Position [m] and rotation of the pelvis.
+        ankle: Position [m] of the ankle and rotation of the foot.
+        knee_towards: Point [m] at whose side of the line from hip to ankle the knee lies; without it the
+            knee lies where the smallest rotation leaves it, which in a deep bend is at the other knee.
     """
     hip, knee, heel, _ = LEGS[side]
     joints = figure.joints
     position, root = pelvis
     target, foot = ankle
     thigh, shin = joints[knee] - joints[hip], joints[heel] - joints[knee]
-    reach = target - (position + root @ (joints[hip] - joints[0]))
+    socket = position + root @ (joints[hip] - joints[0])
+    reach = target - socket
     longest = np.hypot(np.linalg.norm(thigh[1:]) + np.linalg.norm(shin[1:]), thigh[0] + shin[0])
     length = min(float(np.linalg.norm(reach)), _LEG_REACH * longest)
     # |thigh + R_x(t) shin|² = length² is cosine cos(t) + sine sin(t) + rest = 0.
@@ -99,6 +116,9 @@ def bend_leg(
     middle, spread = np.arctan2(sine, cosine), np.arccos(np.clip(-rest / np.hypot(cosine, sine), -1, 1))
     bend = middle + spread  # of the two solutions the one in which the knee points forward
     hip_world = _shortest_turn(root @ (thigh + turn("x", bend) @ shin), reach) @ root
+    if knee_towards is not None:
+        axis = reach / np.linalg.norm(reach)
+        hip_world = _turn_about(axis, hip_world @ thigh, knee_towards - socket) @ hip_world
     pose[hip] = vector(root.T @ hip_world)
     pose[knee] = [bend, 0.0, 0.0]
     pose[heel] = vector((hip_world @ turn("x", bend)).T @ foot)
@@ -110,6 +130,12 @@ def _shortest_turn(start: Point, end: Point) -> Matrix:
     if sine < 1e-12:
         return np.eye(3)
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, start @ end)).as_matrix()
+
+
+def _turn_about(axis: Point, start: Point, end: Point) -> Matrix:
+    """Rotation about a unit axis after which both directions lie on the same side of it."""
+    angle = np.arctan2(axis @ np.cross(start, end), start @ end - (axis @ start) * (axis @ end))
+    return Rotation.from_rotvec(axis * angle).as_matrix()
 
 
 def turn(axis: str, angle: float) -> Matrix:

@@ -33,6 +33,8 @@ class PoseFamily:
     """Both sides get the same turns, mirrored."""
     lagging: dict[str, Ranges] | None = None
     """Ranges of the other side, where a family is lopsided; which side that is is drawn."""
+    weight: float = 1.0
+    """How often it is drawn, relative to the others."""
 
 
 FAMILIES = (
@@ -64,11 +66,12 @@ FAMILIES = (
     PoseFamily(
         "squat",
         limbs={
-            "hip": ((-130, -20), (-60, 15), (0, 30)), "knee": ((10, 150), (-5, 5), (-5, 5)),
-            "ankle": ((-40, 10), (-8, 40), (-40, 8)), "shoulder": ((-30, 30), (-90, 10), (-80, 0)),
+            "hip": ((-150, -20), (-25, 30), (0, 40)), "knee": ((10, 150), (-5, 5), (-5, 5)),
+            "ankle": ((-40, 10), (-8, 15), (-25, 8)), "shoulder": ((-30, 30), (-90, 10), (-80, 0)),
         },
-        spine={"spine1": ((-5, 30), (-10, 10), (-8, 8)), "spine2": ((-5, 20), (-8, 8), (-6, 6))},
+        spine={"spine1": ((-5, 30), (-10, 10), (-8, 8)), "spine2": ((-5, 28), (-8, 8), (-6, 6))},
         alike=True,
+        weight=2.0,
     ),
     PoseFamily(
         "stride",

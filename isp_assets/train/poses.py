@@ -24,7 +24,7 @@ BETA_RANGE = 2.0
 
 _NOISE = 0.05  # of every joint [rad]
 _LARGEST_BLEND = 0.5
-_FAMILY_SHARE = 0.3  # of the poses
+_FAMILY_SHARE = 0.35  # of the poses
 _TUMBLED_SHARE = 0.1  # of the poses: lying, rolled, upside down
 
 
@@ -95,7 +95,8 @@ def _deliberate(poses: Float[Tensor, "n 24 3"], generator: torch.Generator) -> F
     """Some of the poses carried part or all of the way to a pose of a family."""
     count = len(poses)
     chosen = torch.rand(count, generator=generator) < _FAMILY_SHARE
-    which = torch.randint(len(FAMILIES), (count,), generator=generator)
+    weights = torch.tensor([family.weight for family in FAMILIES])
+    which = torch.multinomial(weights, count, replacement=True, generator=generator)
     share = torch.rand(count, 1, generator=generator).sqrt()  # rather far than near
     result = poses.clone()
     for number, family in enumerate(FAMILIES):

@@ -128,14 +128,20 @@ def arms_crossed(figure: Figure) -> Motion:
 
 
 def squat(figure: Figure, depth: float = 0.48) -> Motion:
-    """Sink by ``depth`` metres with the arms stretched forward, and rise again."""
+    """Sink by ``depth`` metres, knees over the toes and arms stretched forward, and rise again."""
+    lean = 1.15 * depth
+
+    def tilt(amount: float) -> float:
+        """Low down the hips flex no further: the pelvis comes up, and the lower back rounds instead."""
+        return lean * amount * (1 - _ease((depth * amount - 0.3) / 0.6))
 
     def upper(pose: Pose, amount: float) -> None:
         _lower_arms(pose, left=1.35 * amount, right=1.35 * amount, bend=0.25 * (1 - amount))
-        pose[_joint("spine1"), 0] = pose[_joint("spine2"), 0] = 0.15 * amount
+        rounding = (lean * amount - tilt(amount)) / 2
+        pose[_joint("spine1"), 0] = pose[_joint("spine2"), 0] = 0.15 * amount + rounding
         pose[_joint("head"), 0] = -0.45 * amount
 
-    return _on_the_spot(figure, upper, sink=0.005, depth=depth, stance=(0.08, 0.3))
+    return _on_the_spot(figure, upper, sink=0.005, depth=depth, tilt=tilt, stance=(0.08, 0.3))
 
 
 def _on_the_spot(
@@ -144,6 +150,7 @@ def _on_the_spot(
     *,
     sink: float,
     depth: float = 0.0,
+    tilt: Callable[[float], float] = lambda _: 0.0,
     stance: tuple[float, float] = (0.0, 0.0),
 ) -> Motion:
     """There and back with planted feet.
@@ -152,6 +159,7 @@ def _on_the_spot(
         upper: Sets the joints above the pelvis for an amount from 0 to 1 and back to 0.
         sink: How far the pelvis is held below full height, so that the knees can bend [m].
         depth: How far the pelvis goes down and, by a third of it, back [m].
+        tilt: How far the pelvis leans forward for an amount [rad].
         stance: How far each foot is set outward [m] and turned outward [rad].
     """
     count = round(_HOLD * FPS)
@@ -161,11 +169,13 @@ def _on_the_spot(
         pose = poses[frame]
         upper(pose, amount)
         pelvis = figure.standing - [0.0, sink + depth * amount, depth / 3 * amount]
-        root = turn("x", 1.15 * depth * amount)
+        root = turn("x", tilt(amount))
         for side, (_, _, ankle, _) in LEGS.items():
             apart, toes_out = sign(side) * np.array(stance)
             target = figure.joints[ankle] + np.array([apart, -figure.floor, 0.0])
-            bend_leg(figure, side, pose, (pelvis, root), (target, turn("y", toes_out)))
+            foot = turn("y", toes_out)
+            over_toes = target + foot @ [0.0, 0.4, 0.15] if depth else None
+            bend_leg(figure, side, pose, (pelvis, root), (target, foot), knee_towards=over_toes)
         pose[0], positions[frame] = vector(root), pelvis - figure.joints[0]
     return Motion(poses, positions, fps=FPS)
 
