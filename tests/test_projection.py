@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from collision_shapes import LEFT_ARM, ball, collision, obstacle, sheet, tube
+from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, sheet, tube
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.energy import Fabric, cloth_rest
 from isp_assets.geometry.grading import face_strain
-from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import ProjectionOptions, project
 from isp_assets.geometry.stretch import StretchLimit
 
@@ -103,6 +103,20 @@ def test_cloth_that_hangs_above_the_rim_of_an_inner_garment_is_not_pulled_into_i
     below = obstacle((funnel, faces), margin=0.0025)
     done = project(hanging[0], collision(hanging), [obstacle(ball(0.05)), below])
     assert done.largest_move < 0.03
+
+
+def test_a_sleeve_is_not_dragged_to_the_strap_of_an_inner_garment() -> None:
+    """All that a vest has of an arm is a patch on its shoulder: what lies beside that is not beneath it."""
+    vest, faces = sheet(41, size=0.4)
+    joints = np.where(np.abs(vest[:, [0, 2]]).max(1) < 0.05, LEFT_ARM, TORSO)
+    below = Obstacle(CollisionMesh.build(faces, np.eye(24)[joints]), vest, margin=0.0025)
+    sleeve = sheet(5, size=0.03, height=-0.03)
+    sleeve[0][:, 0] += 0.09
+    found = below.contacts(sleeve[0], collision(sleeve, LEFT_ARM).parts, within=0.06)
+    assert found.on_cut.all()
+    assert found.height.max() < -0.03
+    done = project(sleeve[0], collision(sleeve, LEFT_ARM), [obstacle(ball(centre=(0, -0.4, 0))), below])
+    assert done.largest_move < 0.001
 
 
 def test_contact_deep_inside_another_body_part_is_left_alone() -> None:

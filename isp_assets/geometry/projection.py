@@ -236,15 +236,16 @@ class _Projector:
 
     def _lift_vertices(self, *, foreign: bool) -> Float[np.ndarray, "V 3"]:
         """The largest lift over all obstacles; foreign contact may only use up room above the own margins."""
-        own = np.zeros_like(self.position)
-        room = np.full(len(self.position), np.inf)
+        own, room = np.zeros_like(self.position), np.full(len(self.position), np.inf)
         for neighbour in self.near:
             obstacle, (index, found) = neighbour.obstacle, self._own_contacts(neighbour)
             margin = obstacle.margin_at(found)
-            reach = np.where(obstacle.border_rings_at(found) < _RIM, _RIM_REACH, self.options.reach)
+            # A sleeve beneath the cut of a layer's strap lies beside the strap.
+            rim = (found.on_cut & (neighbour is not self.near[-1])) | (obstacle.border_rings_at(found) < _RIM)
+            reach = np.where(rim, _RIM_REACH, self.options.reach)
             keep_larger(own, shortest_way(self.position[index], found, margin, reach), index)
-            spare = np.where(found.on_border, np.inf, (found.height - margin).clip(0))
-            room[index] = np.minimum(room[index], spare)
+            spare = (found.height - margin).clip(0)
+            room[index] = np.minimum(room[index], np.where(found.on_border, np.inf, spare))
         if not foreign:
             return own
         ways = Ways(room, self.options.reach, self.options.foreign_reach)
