@@ -70,7 +70,7 @@ class ProjectionOptions:
     poke_reach: float = 0.015
     """How far a vertex beneath may poke through a triangle [m] and still lift it."""
     longest_move: float = 0.05
-    """A vertex that was moved this far [m] is caught between surfaces: it counts as having no room."""
+    """No vertex is moved further [m]: there it is caught between surfaces, and counts as having no room."""
     tolerance: float = 1e-4
     """Lifts below this [m] count as none."""
 
@@ -225,11 +225,11 @@ class _Projector:
 
     def _move(self, step: Float[np.ndarray, "V 3"]) -> None:
         self.position = self.position + step
-        total = self.position - self.start
         moved = np.abs(step).max(1) > self.options.tolerance
-        far = np.einsum("vc,vc->v", total, total) > self.options.longest_move**2
-        if far.any():
-            self.tight |= far
+        total, longest = self.position - self.start, self.options.longest_move
+        far = np.flatnonzero(np.einsum("vc,vc->v", total, total) > longest**2)
+        way = total[far] / np.linalg.norm(total[far], axis=1, keepdims=True)
+        self.position[far], self.tight[far] = self.start[far] + longest * way, True
         for neighbour in self.near:
             neighbour.watched |= moved
             neighbour.found = None
