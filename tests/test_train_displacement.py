@@ -272,6 +272,9 @@ def test_trained_bundle_is_written_with_its_displacements_and_figures(
         torch.equal(a, b)
         for a, b in zip(result.drape_field.parameters(), early.drape_field.parameters(), strict=True)
     )
+    assert "earlier" not in result.provenance["drape"]
+    further = displacement.with_displacement(result, tmp_path)
+    assert further.provenance["drape"]["earlier"] == result.provenance["drape"]
 
 
 def test_training_further_begins_with_contact_at_its_full_stiffness(

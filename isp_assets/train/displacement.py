@@ -253,6 +253,8 @@ def with_displacement(
     network = DrapeField(DrapeFieldConfig.from_dict(manifest["config"]["field"]))
     network.load_state_dict(weights)
     notes = {key: manifest[key] for key in ("step", "seconds", "seed", "config")}
+    if bundle.drape_field is not None:
+        notes["earlier"] = bundle.provenance.get("drape", {})
     return replace(
         bundle,
         drape_field=network.eval().requires_grad_(False),
