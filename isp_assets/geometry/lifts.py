@@ -46,6 +46,8 @@ class Neighbour:
             close[topology.faces[any_corner(close, topology.faces)]] = True
         self.found: Closest | None = found
         """What the first query found, until vertices move."""
+        self.depth = obstacle.margin - found.height
+        """How far each vertex is from keeping the margin at the start [m]."""
         self.watched = found.height < WATCHED
         self.other: Bool[np.ndarray, "V 6"] | None = None
         """Parts of it that each vertex may touch without belonging to them; None until first looked at."""

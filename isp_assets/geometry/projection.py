@@ -70,7 +70,7 @@ class ProjectionOptions:
     poke_reach: float = 0.015
     """How far a vertex beneath may poke through a triangle [m] and still lift it."""
     longest_move: float = 0.05
-    """No vertex is moved further [m]: there it is caught between surfaces, and counts as having no room."""
+    """No vertex moves further [m], or 1.1 times its depth at the start: it is caught, as if without room."""
     tolerance: float = 1e-4
     """Lifts below this [m] count as none."""
 
@@ -123,8 +123,7 @@ def project(
     if not np.isfinite(start).all():
         raise GeometryError("garment positions hold NaN or infinity; check the networks' output")
     options = options or ProjectionOptions()
-    if parts is not None:
-        mesh = replace(mesh, parts=parts)
+    mesh = mesh if parts is None else replace(mesh, parts=parts)
     work = _Projector(start, mesh, obstacles, options, stretch)
     rounds = work.lift()
     work.keep_order()
@@ -154,6 +153,8 @@ class _Projector:
             found = obstacle.contacts(position, open_parts, within=ASIDE)
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
+        deepest = np.max([n.depth for n in self.near], axis=0).clip(max=options.reach)
+        self.longest = np.maximum(options.longest_move, 1.1 * deepest)
         self.tight: Bool[np.ndarray, " V"] = np.any([n.cramped for n in self.near], axis=0)
         self.narrow: Float[np.ndarray, " V"] = np.max([n.narrow for n in self.near], axis=0)
         cramped = fade_out(self.narrow, mesh.topology.faces, reach=_BESIDE, edge=edge)
@@ -182,10 +183,9 @@ class _Projector:
             rings = 0 if last else options.spread
             step = spread(lift, self.mesh.topology.neighbour_average, rings=rings, decay=_SPREAD_DECAY)
             self._move(step)
-            if last:
-                break
-            self._move(flatten(self.position, self.mesh, np.maximum(self.narrow, self.pressed)))
-            self.ease(steps=options.ease - 1)
+            if not last:
+                self._move(flatten(self.position, self.mesh, np.maximum(self.narrow, self.pressed)))
+                self.ease(steps=options.ease - 1)
         return options.rounds
 
     def keep_order(self) -> None:
@@ -226,10 +226,10 @@ class _Projector:
     def _move(self, step: Float[np.ndarray, "V 3"]) -> None:
         self.position = self.position + step
         moved = np.abs(step).max(1) > self.options.tolerance
-        total, longest = self.position - self.start, self.options.longest_move
-        far = np.flatnonzero(np.einsum("vc,vc->v", total, total) > longest**2)
-        way = total[far] / np.linalg.norm(total[far], axis=1, keepdims=True)
-        self.position[far], self.tight[far] = self.start[far] + longest * way, True
+        total = self.position - self.start
+        far = np.flatnonzero(np.einsum("vc,vc->v", total, total) > self.longest**2)
+        share = self.longest[far] / np.linalg.norm(total[far], axis=1)
+        self.position[far], self.tight[far] = self.start[far] + share[:, None] * total[far], True
         for neighbour in self.near:
             neighbour.watched |= moved
             neighbour.found = None
