@@ -172,7 +172,6 @@ def test_places_without_room_are_named_and_no_vertex_is_thrown_about() -> None:
     assert body.tight.any()
     assert done.tight.any()
     assert np.isfinite(done.vertices).all()
-    # Easing comes first, and is not counted.
     assert done.largest_move < ProjectionOptions().longest_move + 1e-9
 
 
