@@ -29,7 +29,7 @@ def trained_angles() -> Float[np.ndarray, " 24"]:
 
     Of poses drawn as training draws them today, from the built-in motions. Networks that saw further
     motions know a little more than that, networks that were trained before less: of the built-in
-    ones, only the skirts' have seen squats as deep as today's. Joints that move no cloth have no limit.
+    ones, the tops' have not seen squats as deep as today's. Joints that move no cloth have no limit.
     """
     clips = load_clips(PoseSource())
     poses = draw_poses(list(clips.train.values()), _DRAWN, torch.Generator().manual_seed(0))

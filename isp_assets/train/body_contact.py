@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from isp_assets.body import Body
 from isp_assets.geometry.contact import Surface, clearance
-from isp_assets.geometry.obstacle import ARMS, BODY_PARTS
+from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, body_parts
 
 _SAME = 1e-6  # two clearances closer than this [m] are from one sample
 
@@ -69,6 +70,12 @@ class PartedBody:
             height, known = clearance(vertices[:, rows], part), best[:, rows]
             best = best.index_copy(1, rows, torch.where(height.abs() < known.abs(), height, known))
         return best
+
+
+def body_limbs(body: Body) -> Bool[Tensor, "P 3"]:
+    """Which arms, or the rest, each vertex of a body counts to; they overlap at their seams."""
+    members = body_parts(body.weights.cpu().numpy())[1]
+    return arms_and_rest(torch.from_numpy(members)).to(body.weights.device)
 
 
 def arms_and_rest(parts: Bool[Tensor, "P 6"]) -> Bool[Tensor, "P 3"]:

@@ -26,11 +26,10 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import body_parts
 from isp_assets.networks.drape_field import DrapeField, DrapeFieldConfig
 from isp_assets.networks.placement import on_device
 from isp_assets.skinning import shape_garment, skin_garment
-from isp_assets.train.body_contact import PartedBody, arms_and_rest
+from isp_assets.train.body_contact import PartedBody, arms_and_rest, body_limbs
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
@@ -93,8 +92,7 @@ class DisplacementTask:
         self.optimizer = options.optimizer
         self.options, self.device, self.fabric = options, torch.device(device), Fabric()
         self.body = body.to(self.device)
-        members = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])
-        self.body_limbs = arms_and_rest(members).to(self.device)
+        self.body_limbs = body_limbs(self.body)
         wardrobe = replace(options.wardrobe, map_size=config.map_size)
         skin_field = on_device(skin.skin_field, self.device)
         samples = build_wardrobe(bundle, self.body, skin_field, wardrobe, seed=seed)

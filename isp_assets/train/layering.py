@@ -24,12 +24,12 @@ from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface, clearance, force
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, body_parts
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.tuck import tuck
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig, LayeringNet
 from isp_assets.skinning import shape_garment
-from isp_assets.train.body_contact import PartedBody, arms_and_rest
+from isp_assets.train.body_contact import PartedBody, arms_and_rest, body_limbs
 from isp_assets.train.drape_energy import Contact, drape_energies, reference_energy
 from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
@@ -107,8 +107,7 @@ class LayeringTask:
         self.optimizer = options.optimizer
         self.body = body.to(self.device)
         self.body_collision = CollisionMesh.build(body.faces.numpy(), body.weights.numpy())
-        members = torch.from_numpy(body_parts(body.weights.cpu().numpy())[1])
-        self.body_limbs = arms_and_rest(members).to(self.device)
+        self.body_limbs = body_limbs(self.body)
         self.module = LayeringNet(options.network)
         if earlier is not None:
             self.module.load_state_dict(earlier.layering_net.state_dict())
