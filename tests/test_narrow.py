@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from collision_shapes import collision, obstacle, sheet
 
+from isp_assets.geometry.energy import Fabric, cloth_rest
 from isp_assets.geometry.intersection import Beneath, measure_intersection
 from isp_assets.geometry.lifts import open_beneath
-from isp_assets.geometry.narrow import flatten, narrowness
+from isp_assets.geometry.narrow import crumpled, flatten, narrowness
 from isp_assets.geometry.obstacle import NO_ROOM, Obstacle
 from isp_assets.geometry.projection import project
+from isp_assets.geometry.stretch import StretchLimit
 
 TORSO, LEFT_ARM = 0, 2  # in the order of the body's parts
 
@@ -82,6 +84,33 @@ def test_smoothing_turns_with_the_cloth_and_takes_roughness_out_of_it() -> None:
         return float(np.square((mesh.topology.neighbour_average @ points - points)[inner, 1]).mean())
 
     assert roughness(cloth + moves) < 0.5 * roughness(cloth)
+
+
+def test_cloth_without_room_may_crumple_and_most_of_all_at_its_border() -> None:
+    """A pinch at the middle of one border, and one in the midst of the cloth."""
+    cloth, faces = sheet(41)
+    mesh, flat = collision((cloth, faces)), cloth[:, [0, 2]]
+    rest = cloth_rest(faces, flat[faces], len(cloth), Fabric())
+    free = StretchLimit.build(rest, held=np.zeros(len(cloth), bool))
+    middle = flat[faces].mean(axis=1)
+
+    def least(pinch: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+        narrow = np.zeros(len(cloth))
+        narrow[np.linalg.norm(flat - pinch, axis=1).argmin()] = 1.0
+        limits = crumpled(free, mesh, narrow, edge=0.005)
+        np.testing.assert_array_equal(free.least, 0.94)  # not written to
+        return limits.least, np.linalg.norm(middle - pinch, axis=1)
+
+    for pinch, lowest, further in (((0.1, 0.0), 0.65, 0.06), ((0.0, 0.0), 0.85, 0.0)):
+        allowed, away = least(pinch)
+        assert allowed[away < 0.004] == pytest.approx(lowest)
+        assert (allowed[away > further] > 0.849).all()
+        near, far = (
+            allowed[(away > 0.05) & (away < 0.06)].mean(),
+            allowed[(away > 0.08) & (away < 0.09)].mean(),
+        )
+        assert 0.87 < near < far < 0.94  # it fades
+        np.testing.assert_array_equal(allowed[away > 0.13], 0.94)
 
 
 def test_folded_cloth_in_a_gap_comes_to_lie_in_it() -> None:

@@ -1,4 +1,4 @@
-"""Cloth that has little room: how little, and how it is smoothed so that layers can lie flat on each other.
+"""Cloth that has little room: how little, how far it may crumple, and how it is smoothed to lie flat.
 
 Where parts of the body press together, the networks leave cloth in folds as small as its
 triangles. Vertices can be lifted apart there, but triangles go on crossing; nobody sees
@@ -11,9 +11,14 @@ from jaxtyping import Float
 from isp_assets.geometry.closest import Closest
 from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import fade_out
+from isp_assets.geometry.stretch import StretchLimit
 
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
+_LEAST = 0.85  # share of its size to which cloth without room may shrink: stretched out, it would buckle
+_AROUND = 0.12  # the same in part for cloth within this distance [m] of it
+_LEAST_AT_BORDER = 0.65  # the same at an open border: nothing holds it back from going into the body
+_AROUND_BORDER = 0.04
 _STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes at once
 _FOLD = 0.018  # about the size of the folds that are smoothed [m], whatever the size of the triangles
 _MOST_STEPS = 9
@@ -32,6 +37,23 @@ def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
     room = obstacle.room[obstacle.mesh.topology.faces[found.face]].min(axis=1)
     beside = (2 - np.abs(found.height) / _BESIDE).clip(0, 1)
     return beside * ((_ROOM - room) / (_ROOM - NO_ROOM)).clip(0, 1)
+
+
+def crumpled(
+    stretch: StretchLimit, mesh: CollisionMesh, narrow: Float[np.ndarray, " V"], *, edge: float
+) -> StretchLimit:
+    """Limits of stretch that let cloth crumple where it has little room.
+
+    Args:
+        stretch: The garment's limits where it hangs freely.
+        mesh: Its collision data.
+        narrow: How little room its vertices have, 0 to 1.
+        edge: Mean length of its edges [m].
+    """
+    faces, at_border = mesh.topology.faces, mesh.topology.border_rings < 1
+    border = fade_out(narrow * at_border, faces, reach=_AROUND_BORDER, edge=edge)
+    stretch = stretch.loosened(fade_out(narrow, faces, reach=_AROUND, edge=edge), least=_LEAST)
+    return stretch.loosened(border, least=_LEAST_AT_BORDER)
 
 
 def flatten(

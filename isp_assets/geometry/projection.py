@@ -32,10 +32,10 @@ from isp_assets.geometry.lifts import (
     over_vertices,
     shortest_way,
 )
-from isp_assets.geometry.narrow import flatten
+from isp_assets.geometry.narrow import crumpled, flatten
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.other_parts import Ways, leave_other_parts
-from isp_assets.geometry.spread import fade_out, keep_larger, spread
+from isp_assets.geometry.spread import keep_larger, spread
 from isp_assets.geometry.stretch import StretchLimit
 
 BODY_MARGIN = 0.003
@@ -46,8 +46,7 @@ LAYER_MARGIN = 0.0025
 _SPREAD_DECAY = 0.9  # part of its neighbours' lift that a vertex follows
 _RIM = 3.0  # edges from an obstacle's open border within which a deep contact may be one from above the rim
 _RIM_REACH = 0.015  # contact deeper than this [m] is left alone there
-_CRAMPED = 0.8  # share of its size to which cloth without room may shrink: stretched out, it would buckle
-_BESIDE = 0.12  # the same in part for cloth within this distance [m] of it
+_LIFT_OUT = 1.1  # a vertex may move this many times its depth at the start
 _ORDER_REACH = 0.015  # a garment further beneath an inner one than this [m] cannot be put above it alone
 
 
@@ -154,11 +153,10 @@ class _Projector:
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
         deepest = np.max([n.depth for n in self.near], axis=0).clip(max=options.reach)
-        self.longest = np.maximum(options.longest_move, 1.1 * deepest)
+        self.longest = np.maximum(options.longest_move, _LIFT_OUT * deepest)
         self.tight: Bool[np.ndarray, " V"] = np.any([n.cramped for n in self.near], axis=0)
         self.narrow: Float[np.ndarray, " V"] = np.max([n.narrow for n in self.near], axis=0)
-        cramped = fade_out(self.narrow, mesh.topology.faces, reach=_BESIDE, edge=edge)
-        self.stretch = None if stretch is None else stretch.loosened(cramped, least=_CRAMPED)
+        self.stretch = None if stretch is None else crumpled(stretch, mesh, self.narrow, edge=edge)
         self.pressed = np.zeros(len(position), bool)
         """Vertices between two body parts: what lifts them off one drives them into the other."""
         self.ease(steps=options.ease)
