@@ -208,6 +208,19 @@ def test_wardrobe_passes_over_codes_that_do_not_decode(task: DisplacementTask) -
     assert all(sample.code[0] > -0.5 for sample in task.wardrobe)
 
 
+def test_garments_with_a_name_of_their_own_come_into_the_wardrobe_first(
+    bundle: GarmentBundle, skin: SkinBundle, body: Body
+) -> None:
+    code = next(iter(bundle.codes.values()))
+    codes = {f"{bundle.category}_{number:04d}": code + 0.01 * number for number in range(20)}
+    named = replace(bundle, codes={**codes, "tight": code + 0.005, "loose_2": code + 0.015})
+    options = WardrobeOptions(garments=2, edge_length=0.07)
+    for seed in range(2):
+        worn = wardrobe.build_wardrobe(named, body, skin.skin_field, options, seed=seed)
+        found = sorted(float(sample.code[0] - code[0]) for sample in worn)
+        assert found == pytest.approx([0.005, 0.015], abs=1e-6)
+
+
 def test_wardrobe_without_sound_garments_is_refused(
     bundle: GarmentBundle,
     skin: SkinBundle,

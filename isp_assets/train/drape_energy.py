@@ -24,11 +24,11 @@ _REFERENCE_LIFT = 0.05  # energies are compared with that of lifting the garment
 class Contact:
     """Penalty for coming nearer to the body than ``margin``."""
 
-    margin: float = 0.007
+    margin: float = 0.008
     """Clearance to keep at the vertices [m]; edges between them cut across curved skin."""
     cubic: float = 250.0
     """Weight of the cube of the lacking clearance [N/m²], as in the paper."""
-    stiffness: float = 4e5
+    stiffness: float = 6e5
     """Weight of its square per mass [1/s²], at the end of training."""
     first_stiffness: float = 2e4
     """The same at the start."""

@@ -1,5 +1,6 @@
 """Garments to train draping on: decoded, bound and measured once."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -57,7 +58,7 @@ class WardrobeOptions:
     """How many garments, and how fine."""
 
     garments: int = 60
-    """Training garments; every third has a jittered or mixed code."""
+    """Training garments; every third has a jittered or mixed code. Those with a name of their own come first."""
     edge_length: float = 0.02
     """Triangle side [m]."""
     map_size: int = 64
@@ -119,10 +120,17 @@ def _rest_strain(sample: WornSample) -> float:
 
 
 def _codes(bundle: GarmentBundle, count: int, rng: np.random.Generator) -> Iterator[Float[np.ndarray, " Z"]]:
-    """Trained codes in random order; after every two of them a jittered one or a mixture of two, in turn."""
+    """Trained codes, after every two of them a jittered one or a mixture of two, in turn.
+
+    Garments with a name of their own are the ones that will be worn, and often the extremes of their
+    category: they come first, then the numbered ones in random order.
+    """
     codes = np.stack(list(bundle.codes.values()))
     spread = codes.std(axis=0)
-    trained = iter(codes[rng.permutation(len(codes))])
+    order = rng.permutation(len(codes))
+    numbered = re.compile(rf"{re.escape(bundle.category)}_\d+")
+    named = [numbered.fullmatch(name) is None for name in bundle.codes]
+    trained = iter(codes[order[np.argsort(~np.asarray(named)[order], kind="stable")]])
     for number in range(count):
         first, second = codes[rng.integers(len(codes), size=2)]
         share, noise = rng.uniform(0, 1), rng.normal(size=spread.shape)
