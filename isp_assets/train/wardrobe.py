@@ -58,7 +58,7 @@ class WardrobeOptions:
     """How many garments, and how fine."""
 
     garments: int = 60
-    """Training garments; every third has a jittered or mixed code. Those with a name of their own come first."""
+    """Training garments; every third has a jittered or mixed code. Named ones come first."""
     edge_length: float = 0.02
     """Triangle side [m]."""
     map_size: int = 64
