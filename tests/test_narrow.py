@@ -101,15 +101,15 @@ def test_cloth_without_room_may_crumple_and_most_of_all_at_its_border() -> None:
         np.testing.assert_array_equal(free.least, 0.94)  # not written to
         return limits.least, np.linalg.norm(middle - pinch, axis=1)
 
-    for pinch, lowest, further in (((0.1, 0.0), 0.65, 0.06), ((0.0, 0.0), 0.85, 0.0)):
+    for pinch, lowest, further in (((0.1, 0.0), 0.68, 0.09), ((0.0, 0.0), 0.83, 0.0)):
         allowed, away = least(pinch)
         assert allowed[away < 0.004] == pytest.approx(lowest)
-        assert (allowed[away > further] > 0.849).all()
+        assert (allowed[away > further] > 0.829).all()
         near, far = (
             allowed[(away > 0.05) & (away < 0.06)].mean(),
             allowed[(away > 0.08) & (away < 0.09)].mean(),
         )
-        assert 0.87 < near < far < 0.94  # it fades
+        assert lowest < near < far < 0.94  # it fades
         np.testing.assert_array_equal(allowed[away > 0.18], 0.94)
 
 

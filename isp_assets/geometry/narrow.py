@@ -15,10 +15,10 @@ from isp_assets.geometry.stretch import StretchLimit
 
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
-_LEAST = 0.85  # share of its size to which cloth without room may shrink: stretched out, it would buckle
+_LEAST = 0.83  # share of its size to which cloth without room may shrink: stretched out, it would buckle
 _AROUND = 0.12  # the same in part for cloth within this distance [m] of it
-_LEAST_AT_BORDER = 0.65  # the same at an open border: nothing holds it back from going into the body
-_AROUND_BORDER = 0.04
+_LEAST_AT_BORDER = 0.68  # the same at an open border: nothing holds it back from going into the body
+_AROUND_BORDER = 0.06
 _STEP = 0.4  # part of the way to its neighbours' mean that a vertex goes at once
 _FOLD = 0.018  # about the size of the folds that are smoothed [m], whatever the size of the triangles
 _MOST_STEPS = 9
