@@ -123,7 +123,7 @@ def _codes(bundle: GarmentBundle, count: int, rng: np.random.Generator) -> Itera
     """Trained codes, after every two of them a jittered one or a mixture of two, in turn.
 
     Garments with a name of their own are the ones that will be worn, and often the extremes of their
-    category: they come first, then the numbered ones in random order.
+    category: they come first, then those that `garment_maker` numbered, in random order.
     """
     codes = np.stack(list(bundle.codes.values()))
     spread = codes.std(axis=0)
