@@ -22,7 +22,6 @@ from isp_assets.body import Body, PosedBody
 from isp_assets.bundle import GarmentBundle, SkinBundle
 from isp_assets.displacement import displace
 from isp_assets.drape_features import drape_features
-from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.energy import Fabric, gravity_energy
 from isp_assets.geometry.grading import graded_rest
@@ -35,7 +34,7 @@ from isp_assets.train.drape_metrics import DrapeCase, energy_gap, measure_drape
 from isp_assets.train.loop import CHECKPOINT, RunOptions, read_checkpoint, train
 from isp_assets.train.optimizers import OptimizerName
 from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
-from isp_assets.train.wardrobe import WardrobeOptions, WornSample, build_wardrobe
+from isp_assets.train.wardrobe import WardrobeOptions, WornSample, build_wardrobe, require_same_body
 
 _QUICK_GARMENTS, _TEST_FRAMES = 3, 8
 
@@ -225,12 +224,7 @@ def train_displacement(
     Raises:
         TrainError: If bundle, skin field and body do not belong together.
     """
-    for what, digest in (("garment bundle", bundle.body_sha256), ("skin bundle", skin.body_sha256)):
-        if digest != body.sha256:
-            raise TrainError(
-                f"the {what} was made for body {digest[:12]}, the body given is {body.sha256[:12]}; "
-                "give the body that all were trained on"
-            )
+    require_same_body(body, {"garment bundle": bundle.body_sha256, "skin bundle": skin.body_sha256})
     task = DisplacementTask(
         bundle, skin, body, options or DisplacementOptions(), device=run.device, seed=run.seed
     )

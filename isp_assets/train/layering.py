@@ -35,7 +35,7 @@ from isp_assets.train.layering_metrics import measure_layering
 from isp_assets.train.loop import RunOptions, train
 from isp_assets.train.optimizers import OptimizerName
 from isp_assets.train.poses import BETA_RANGE, PoseSource, draw_poses, load_clips
-from isp_assets.train.wardrobe import WardrobeOptions
+from isp_assets.train.wardrobe import WardrobeOptions, require_same_body
 from isp_assets.train.wearers import Wearer, build_wearers
 
 LAYER_REACH = 0.05
@@ -249,14 +249,8 @@ def train_layering(
     """
     if not bundles:
         raise TrainError("layering needs at least one garment bundle")
-    for what, digest in [(f"bundle {b.category!r}", b.body_sha256) for b in bundles] + [
-        ("the skin bundle", skin.body_sha256)
-    ]:
-        if digest != body.sha256:
-            raise TrainError(
-                f"{what} was made for body {digest[:12]}, the body given is {body.sha256[:12]}; "
-                "give the body that all were trained on"
-            )
+    made_for = {f"bundle {bundle.category!r}": bundle.body_sha256 for bundle in bundles}
+    require_same_body(body, made_for | {"skin bundle": skin.body_sha256})
     options = options or LayeringOptions()
     task = LayeringTask(bundles, skin, body, options, earlier=earlier, device=run.device, seed=run.seed)
     report = train(task, out, run)

@@ -1,7 +1,7 @@
 """Garments to train draping on: decoded, bound and measured once."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +83,24 @@ def make_sample(
         rest=rest.to(dtype=torch.float32),
         parts=torch.from_numpy(body_parts(bound.joint_weights.cpu().numpy())[0]),
     )
+
+
+def require_same_body(body: Body, made_for: Mapping[str, str]) -> None:
+    """Refuse bundles of another body.
+
+    Args:
+        body: The body to train on.
+        made_for: By bundle, the digest of the body that it was made for.
+
+    Raises:
+        TrainError: If one of them is not the body's.
+    """
+    for what, digest in made_for.items():
+        if digest != body.sha256:
+            raise TrainError(
+                f"the {what} was made for body {digest[:12]}, the body given is {body.sha256[:12]}; "
+                "give the body that all were trained on"
+            )
 
 
 def build_wardrobe(
