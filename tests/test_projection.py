@@ -26,6 +26,11 @@ def _heights(vertices: np.ndarray, beneath: Obstacle) -> np.ndarray:
     return beneath.whole(vertices).height
 
 
+def _normals_x(vertices: np.ndarray, faces: np.ndarray) -> float:
+    corner = vertices[faces]
+    return float(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, 0].sum())
+
+
 def test_a_sunk_garment_comes_out_to_the_margin_and_crosses_nothing() -> None:
     cloth, body = _sunk_tube(), obstacle(ball())
     assert len(crossing_pairs(*cloth, *ball())) > 50
@@ -212,6 +217,28 @@ def test_projection_moves_with_the_scene() -> None:
 
     moved = project(there(cloth[0]), collision(cloth), [obstacle((there(body[0]), body[1]))]).vertices
     np.testing.assert_allclose(moved, there(here), atol=1e-6)
+
+
+def test_cloth_beside_a_fold_of_a_layer_that_faces_away_stays() -> None:
+    """Three to five centimetres "beneath" a fold 6 cm high: only skin to which there is no way lies there."""
+    body = obstacle(sheet(41, size=0.4))
+    upright, faces = sheet(21)
+    upright = upright[:, [1, 0, 2]] * [1, 0.3, 1] + [0.06, 0.02, 0]
+    cloth = sheet(9, size=0.02, height=0.004)
+    away = faces if _normals_x(upright, faces) > 0 else faces[:, ::-1]
+    fold = obstacle((upright, np.ascontiguousarray(away)), margin=0.0025)
+    for shift in (0.0, 0.02):
+        beside = cloth[0] + [shift, 0, 0]
+        assert fold.whole(beside).height.max() < -0.025
+        done = project(beside, collision(cloth), [body, fold])
+        np.testing.assert_array_equal(done.vertices, beside)
+
+
+def test_cloth_deep_beneath_a_layer_that_stands_off_the_skin_is_lifted_over_it() -> None:
+    body, cloth = obstacle(sheet(41, size=0.4)), sheet(9, size=0.02, height=0.004)
+    layer = obstacle(sheet(41, size=0.4, height=0.04), margin=0.0025)
+    done = project(cloth[0], collision(cloth), [body, layer])
+    assert _heights(done.vertices, layer).min() > 0.0025 - 2e-4
 
 
 def test_spreading_keeps_a_single_push_from_standing_out() -> None:
