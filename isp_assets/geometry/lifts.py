@@ -63,7 +63,7 @@ class Neighbour:
         """How little room each vertex has over it, 0 to 1."""
 
 
-def contacts(
+def credible_contacts(
     points: Float[np.ndarray, "P 3"], parts: Bool[np.ndarray, "P 6"], obstacle: Obstacle, *, body: Obstacle
 ) -> Closest:
     """Closest points on an obstacle; infinite heights where nothing can lie beneath it.
@@ -83,7 +83,8 @@ def contacts(
         return found
     stands_off = body.contacts(found.point[deep], obstacle.parts_at(found.face[deep]), within=ASIDE).height
     above = body.contacts(points[deep], parts[deep], within=ASIDE).height
-    beside = deep[above - found.height[deep] > stands_off + _DEEPER]  # either may be infinite
+    # Beneath the layer, height over the skin and depth would make up what it stands off. All may be infinite.
+    beside = deep[above - found.height[deep] > stands_off + _DEEPER]
     height = found.height.copy()
     height[beside] = np.inf
     return replace(found, height=height)

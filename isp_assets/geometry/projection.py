@@ -26,7 +26,7 @@ from isp_assets.geometry.lifts import (
     CLEAR,
     Neighbour,
     any_corner,
-    contacts,
+    credible_contacts,
     open_beneath,
     over_planes,
     over_vertices,
@@ -149,7 +149,7 @@ class _Projector:
         """What lies beneath, the outermost layer first and the body last."""
         open_parts, edge = mesh.parts, mean_edge(position, mesh.topology.faces)
         for obstacle in reversed(obstacles):
-            found = contacts(position, open_parts, obstacle, body=obstacles[0])
+            found = credible_contacts(position, open_parts, obstacle, body=obstacles[0])
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
         deepest = np.max([n.depth for n in self.near], axis=0).clip(max=options.reach)
@@ -257,7 +257,7 @@ class _Projector:
             return np.arange(len(self.position)), neighbour.found
         index = np.flatnonzero(neighbour.watched)
         points, own = self.position[index], neighbour.own[index]
-        return index, contacts(points, own, neighbour.obstacle, body=self.near[-1].obstacle)
+        return index, credible_contacts(points, own, neighbour.obstacle, body=self.near[-1].obstacle)
 
     def _lift_triangles(
         self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, gap: float | None = None
