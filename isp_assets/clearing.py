@@ -1,4 +1,4 @@
-"""Clear a layer of all that lies beneath it, frame by frame; and calm what that does from frame to frame.
+"""Clear a layer of all that lies beneath it, frame by frame; relax it; calm both from frame to frame.
 
 Projection knows one frame only. Where cloth is caught between surfaces it may choose
 another way out in the next frame, and a few vertices flicker. Calming lets the moves
@@ -19,6 +19,11 @@ from isp_assets.errors import DrapeError
 from isp_assets.geometry.buried import LaidCloth
 from isp_assets.geometry.obstacle import Obstacle
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
+from isp_assets.geometry.relaxation import apart_from_arms, relax
+
+_STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
+
+_GENTLE = ProjectionOptions(rounds=3, ease=0, gentle=True)
 
 Obstacles = Sequence[Sequence[Obstacle]]
 """Per frame, what lies beneath: the body, then every finished layer."""
@@ -38,6 +43,45 @@ def clear_layer(
         project(cloth.vertices, worn.collision, beneath, options, stretch=worn.stretch, parts=cloth.parts)
         for cloth, beneath in zip(laid, obstacles, strict=True)
     ]
+
+
+def relax_layer(
+    worn: WornGarment, laid: Sequence[LaidCloth], cleared: Sequence[Projection], obstacles: Obstacles
+) -> list[Projection | None]:
+    """Relax a layer in the frames that strain it, and clear it once more.
+
+    A share of the way is gone that grows with the strain, so that cloth does not jump as a pose gets hard.
+
+    Args:
+        worn: The layer.
+        laid: The layer before projection.
+        cleared: Its projections.
+        obstacles: What lies beneath.
+
+    Returns:
+        What takes the place of each projection; None where nothing does.
+    """
+    return [
+        _relaxed(worn, cloth, done, beneath)
+        for cloth, done, beneath in zip(laid, cleared, obstacles, strict=True)
+    ]
+
+
+def _relaxed(
+    worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle]
+) -> Projection | None:
+    strain = worn.elastic.strain_p99(done.vertices)
+    share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
+    if share == 0:
+        return None
+    mesh = replace(worn.collision, parts=cloth.parts)
+    goal = relax(done.vertices, worn.elastic, mesh, beneath)
+    position = done.vertices + share * (goal - done.vertices)
+    own = apart_from_arms(cloth.parts)
+    clear = project(position, worn.collision, beneath, _GENTLE, parts=own)
+    if worn.elastic.strain_p99(clear.vertices) >= strain:
+        return None  # a body that cuts itself this deeply leaves no room for the state that was found
+    return replace(clear, tight=done.tight | clear.tight, pressed=done.pressed | clear.pressed)
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """Drape an outfit over a shot: the ladder of solvers, chunk by chunk.
 
 Rungs, in order: ``skin`` (Eqs. 6-7), ``displace`` (D_s), ``tuck`` (a wide inner layer gives
-way to a held one worn over it), ``layering`` (D_m, Eqs. 9-12), ``project`` (leaves no contact).
+way to a held one worn over it), ``layering`` (D_m, Eqs. 9-12), ``project`` (leaves no contact),
+``relax`` (moves what a pose strains as a whole).
 Each layer is corrected once against everything beneath it, so the cost of layering grows
 linearly with the number of layers. A rung that a frame does not need is skipped there, and
 the chunk says what ran.
@@ -10,6 +11,7 @@ Reference: Li, Guillard and Fua, "ISP: Multi-Layered Garment Draping with
 Implicit Sewing Patterns", NeurIPS 2023, Section 3.2.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import PosedBody
-from isp_assets.clearing import Calm, clear_layer
+from isp_assets.clearing import Calm, clear_layer, relax_layer
 from isp_assets.conventions import NUM_JOINTS, FrameRange
 from isp_assets.displacement import displace, displacements
 from isp_assets.drape_features import drape_features
@@ -29,14 +31,14 @@ from isp_assets.frames import DrapedFrames, FrameChunk, Scene, StageTimes
 from isp_assets.geometry.buried import BodyObstacle, HomeSkin, lay_on_skin
 from isp_assets.geometry.contact import Surface
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
-from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, ProjectionOptions
+from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, Projection, ProjectionOptions
 from isp_assets.layering import correct_layer
 from isp_assets.outfit import Outfit
-from isp_assets.shot import DEFAULT_RESOLUTION, Shot
+from isp_assets.shot import DEFAULT_RESOLUTION, DEFAULT_TUCK_DEPTH, Shot
 from isp_assets.skinning import skin_garment
 from isp_assets.tucking import Tucking
 
-STEPS = ("skin", "displace", "tuck", "layering", "project")
+STEPS = ("skin", "displace", "tuck", "layering", "project", "relax")
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class DrapeOptions:
     """Rungs to run; ``skin`` is always needed."""
     resolution: int = DEFAULT_RESOLUTION
     """Grid cells across a panel, 32 to 512."""
+    tuck_depth: float | None = DEFAULT_TUCK_DEPTH
+    """How far tucked cloth is kept beneath a waistband [m]; what is deeper, nobody sees. None keeps all."""
     chunk: int = 8
     """Frames held at once."""
     device: str = "cpu"
@@ -69,6 +73,8 @@ class DrapeOptions:
             )
         if not 0 <= self.smoothing < 1:
             raise DrapeError(f"smoothing must be at least 0 and below 1, got {self.smoothing:g}")
+        if self.tuck_depth is not None and not self.tuck_depth >= 0:
+            raise DrapeError(f"tuck_depth must be at least 0 m, or None, got {self.tuck_depth:g}")
         if self.chunk < 1:
             raise DrapeError(f"chunk must be at least 1 frame, got {self.chunk}")
 
@@ -120,7 +126,10 @@ class Draper:
         self.shot, self.options = shot, options
         self.body = shot.body.to(options.device)
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
-        worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
+        worn = dress(
+            outfit, self.body, self.betas,
+            resolution=options.resolution, device=options.device, tuck_depth=options.tuck_depth,
+        )  # fmt: skip
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
         self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
         self.worn = self.tucking.worn if self.tucking else worn
@@ -146,9 +155,8 @@ class Draper:
     def _tucking(self, worn: tuple[WornGarment, ...]) -> Tucking:
         """Find what is tucked in at rest."""
         posed = self.body.pose(torch.zeros(1, NUM_JOINTS, 3, device=self.options.device), betas=self.betas)
-        rest = [skin_garment(garment.skin, posed, self.betas)[0][0] for garment in worn]
         skin = Obstacle(self.body_collision, posed.vertices[0].cpu().numpy(), margin=self.options.body_margin)
-        return Tucking(worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
+        return Tucking(worn, [garment.rest for garment in worn], skin)
 
     @torch.no_grad()
     def chunk(self, rows: slice) -> FrameChunk:
@@ -227,11 +235,12 @@ class Draper:
                 )
             note(ran, "layering", touched)
         state.keep("layering", vertices, keep)
+        tight: list[np.ndarray | None] = [None] * len(vertices)
         result = vertices.cpu().numpy()
-        tight: list[np.ndarray | None] = [None] * len(result)
         if "project" in steps:
-            with state.timed("project"):
-                result, tight = self._clear(index, vertices, posed, state)
+            result, tight = self._clear(index, vertices, posed, state)
+        else:
+            state.keep("project", vertices, keep)
         outside = torch.as_tensor(result, device=vertices.device)
         state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
         margin = self.options.layer_margin
@@ -246,24 +255,31 @@ class Draper:
     def _clear(
         self, index: int, vertices: Float[Tensor, "T V 3"], posed: PosedBody, state: ChunkState
     ) -> tuple[Float[np.ndarray, "T V 3"], list[np.ndarray | None]]:
-        """Projected vertices, and per frame which of them have no room."""
-        worn, home = self.worn[index], self.homes[index]
-        before, skinned = (part.cpu().double().numpy() for part in (vertices, state.skinned[index]))
-        gap = 2 * self.options.body_margin + index * self.options.layer_margin
-        laid = [
-            lay_on_skin(frame, own, worn.collision, home, body, gap=gap)
-            for frame, own, body in zip(before, skinned, state.bodies, strict=True)
-        ]
-        obstacles = state.obstacles
-        cleared = clear_layer(worn, laid, obstacles, self.options.projection)
-        for done, ran in zip(cleared, state.steps[index], strict=True):
-            if done.ran:
-                ran.append("project")
-        result = np.stack([done.vertices for done in cleared])
-        if self.options.smoothing:
-            turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
-            result = self.calm[index].follow(worn, laid, cleared, obstacles, turns)
-        return result.astype(np.float32), [done.tight for done in cleared]
+        """Projected and relaxed vertices, and per frame which of them have no room."""
+        worn, home, ran = self.worn[index], self.homes[index], state.steps[index]
+        obstacles, options = state.obstacles, self.options
+        with state.timed("project"):
+            before, skinned = (part.cpu().double().numpy() for part in (vertices, state.skinned[index]))
+            gap = 2 * options.body_margin + index * options.layer_margin
+            laid = [
+                lay_on_skin(frame, own, worn.collision, home, body, gap=gap)
+                for frame, own, body in zip(before, skinned, state.bodies, strict=True)
+            ]
+            cleared = clear_layer(worn, laid, obstacles, options.projection)
+        note(ran, "project", np.array([done.ran for done in cleared]))
+        state.keep("project", _stacked(cleared), options.keep_stages)
+        if "relax" in options.steps:
+            with state.timed("relax"):
+                relaxed = relax_layer(worn, laid, cleared, obstacles)
+            note(ran, "relax", np.array([found is not None for found in relaxed]))
+            cleared = [found or done for found, done in zip(relaxed, cleared, strict=True)]
+        result = _stacked(cleared)
+        if options.smoothing:
+            with state.timed("project"):
+                turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
+                calmed = self.calm[index].follow(worn, laid, cleared, obstacles, turns)
+            result = torch.as_tensor(calmed, dtype=torch.float32)
+        return result.numpy(), [done.tight for done in cleared]
 
     def _check_finite(self, layers: tuple[np.ndarray, ...], frames: np.ndarray) -> None:
         for worn, positions in zip(self.worn, layers, strict=True):
@@ -273,3 +289,7 @@ class Draper:
                     f"layer {worn.layer.name}: positions are not finite in frame {frames[bad][0]}; "
                     "the pose, betas or code lies far outside the trained range"
                 )
+
+
+def _stacked(cleared: Sequence[Projection]) -> Float[Tensor, "T V 3"]:
+    return torch.from_numpy(np.stack([done.vertices for done in cleared]).astype(np.float32))

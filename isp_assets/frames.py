@@ -25,6 +25,8 @@ class Layer:
     """sRGB image over `Garment.st`; row 0 is the top (t = 1)."""
     color: tuple[float, float, float]
     """Display colour, sRGB in 0..1."""
+    trimmed: float = 0.0
+    """Share of its cloth that was cut off, because it is tucked in too deep to be seen."""
 
 
 @dataclass(frozen=True, eq=False)

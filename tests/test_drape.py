@@ -102,7 +102,7 @@ def test_stages_are_kept_on_request_only(outfit: Outfit, shot: Shot) -> None:
     (chunk,) = list(drape(outfit, shot, QUICK))
     assert chunk.stages == {}
     (chunk,) = list(drape(outfit, shot, replace(QUICK, keep_stages=True)))
-    assert set(chunk.stages) == set(STEPS) - {"project"}
+    assert set(chunk.stages) == set(STEPS) - {"relax"}
 
 
 def test_projection_moves_nothing_far(outfit: Outfit, shot: Shot) -> None:

@@ -55,7 +55,7 @@ HOLD_FIGURES: dict[str, str] = {
 }
 """What each figure of a held start means."""
 
-_LADDER = ("skin", "displace", "tuck", "layering", "project")
+_LADDER = ("skin", "displace", "tuck", "layering", "project", "relax")
 _DISTANCES = ("strain_p99", "body_area_percent", "crossing_pairs")
 
 Progress = Callable[[int, int, str], None]
@@ -174,7 +174,7 @@ def _states(
     ladder: FrameChunk, name: str, result: PhysicsResult
 ) -> tuple[dict[str, Positions], dict[str, float]]:
     """Positions by state, and time per frame [s]; rungs that changed nothing are left out."""
-    rungs = {**ladder.stages, "project": ladder.layers}
+    rungs = {**ladder.stages, "relax": ladder.layers}
     seconds = ladder.times.seconds
     spent, states, times = seconds.get("body", 0.0), {}, {}
     before: Positions | None = None

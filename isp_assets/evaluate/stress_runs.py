@@ -236,7 +236,10 @@ def _calmed(
 
 def _worn(case: StressCase) -> tuple[WornGarment, ...]:
     betas = torch.as_tensor(case.shot.betas, dtype=torch.float32)
-    return dress(case.outfit, case.shot.body, betas, resolution=case.options.resolution)
+    options = case.options
+    return dress(
+        case.outfit, case.shot.body, betas, resolution=options.resolution, tuck_depth=options.tuck_depth
+    )
 
 
 def _body_collision(case: StressCase) -> CollisionMesh:

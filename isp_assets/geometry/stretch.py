@@ -67,7 +67,7 @@ class StretchLimit:
         faces = rest.faces.cpu().numpy()
         inverse = rest.inverse_rest.cpu().double().numpy()
         area = rest.area.cpu().double().numpy()
-        gradient = _gradient(faces, inverse, len(held))
+        gradient = deformation_gradient(faces, inverse, len(held))
         weighted = (gradient.T @ diags_array(np.repeat(area, 2))).tocsr()
         inertia = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(held)) / _FOLLOW**2
         inertia = np.where(held, _HELD * inertia.max(), inertia)
@@ -116,9 +116,16 @@ class StretchLimit:
         return offered, bool((first != 1).any() or (second != 1).any())
 
 
-def _gradient(
+def deformation_gradient(
     faces: Int[np.ndarray, "F 3"], inverse: Float[np.ndarray, "F 2 2"], num_vertices: int
 ) -> csr_array:
+    """[2 F, V]: the matrix that takes positions to the two columns of every face's deformation gradient.
+
+    Args:
+        faces: Triangles.
+        inverse: Inverse of the flat edge matrix of every face [1/m].
+        num_vertices: V.
+    """
     corner = np.empty((len(faces), 2, 3))
     corner[:, :, 1] = inverse[:, 0, :]
     corner[:, :, 2] = inverse[:, 1, :]
