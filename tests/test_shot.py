@@ -28,10 +28,8 @@ def test_defaults(tmp_path: Path) -> None:
 
 
 def test_every_key(tmp_path: Path) -> None:
-    text = (
-        GOOD
-        + 'name = "a"\nframes = "3-9x2"\nbetas = [1, -0.5]\nresolution = 64\ntuck_depth = "all"\nwrite = ["usd"]\n'
-    )
+    text = GOOD + 'name = "a"\nframes = "3-9x2"\nbetas = [1, -0.5]\nresolution = 64\nwrite = ["usd"]\n'
+    text += 'tuck_depth = "all"\n'
     job = load(tmp_path, text)
     assert job.shot.name == "a"
     assert job.shot.motion.frames.tolist() == [3, 5, 7, 9]
