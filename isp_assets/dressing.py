@@ -19,7 +19,7 @@ from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displac
 from isp_assets.frames import Layer
 from isp_assets.garment import Garment
 from isp_assets.geometry.energy import Fabric, cloth_rest
-from isp_assets.geometry.grading import graded_rest
+from isp_assets.geometry.grading import edge_lengths, graded_rest
 from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.geometry.relaxation import ElasticCloth
 from isp_assets.geometry.stretch import StretchLimit
@@ -107,7 +107,7 @@ def _wear(outfit: Outfit, index: int, piece: Piece, betas: Tensor, *, device: st
         sampler = panel_sampler(garment, item.bundle.model, resolution=field.config.map_size)
         displacement = bind_displacement(field, sampler.to(device), ramp)
     return WornGarment(
-        layer=_layer(outfit.layer_name(index), piece, item),
+        layer=_layer(outfit.layer_name(index), piece, item, edge_lengths(graded)),
         code=torch.as_tensor(item.code, device=device),
         rest=piece.rest,
         faces=torch.as_tensor(garment.faces, device=device),
@@ -130,6 +130,6 @@ def _layering(outfit: Outfit, garment: Garment, item: OutfitItem, device: str) -
     return bind_layering(network, garment, sampler, device=device)
 
 
-def _layer(name: str, piece: Piece, item: OutfitItem) -> Layer:
+def _layer(name: str, piece: Piece, item: OutfitItem, lengths: Float[np.ndarray, "F 3"]) -> Layer:
     texture = np.ascontiguousarray(bake_texture(piece.garment, item.style))
-    return Layer(name, piece.garment, texture, item.style.color, piece.trimmed)
+    return Layer(name, piece.garment, texture, item.style.color, piece.trimmed, lengths)

@@ -27,6 +27,17 @@ class Layer:
     """Display colour, sRGB in 0..1."""
     trimmed: float = 0.0
     """Share of its cloth that was cut off, because it is tucked in too deep to be seen."""
+    graded_lengths: Float[np.ndarray, "F 3"] | None = None
+    """Flat lengths of every face's edges, from each corner to the next, once its pattern is graded to the
+    wearer [m]; None if it is worn as drawn."""
+
+    @property
+    def flat_lengths(self) -> Float[np.ndarray, "F 3"]:
+        """The same, as drawn where nothing was graded [m]."""
+        if self.graded_lengths is not None:
+            return self.graded_lengths
+        corner = self.garment.corner_xy
+        return np.linalg.norm(np.roll(corner, -1, axis=1) - corner, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from isp_assets.errors import GeometryError
-from isp_assets.evaluate.frames import FIGURES, FrameMeter, edge_strain, summarise
+from isp_assets.evaluate.frames import FIGURES, FrameMeter, summarise
 from isp_assets.frames import FrameChunk
+from isp_assets.geometry.grading import edge_strain
 from isp_assets.synthetic import SyntheticShot, synthetic_shot
 
 
@@ -77,12 +78,25 @@ def test_stages_are_measured_on_request(shot: SyntheticShot, chunk: FrameChunk) 
 
 
 def test_strain_is_the_stretch_and_blind_to_rigid_motion() -> None:
-    flat = np.array([[[0, 0], [1, 0], [0, 1]]], float)
+    lengths = np.array([[1, np.sqrt(2), 1]])
     faces = np.array([[0, 1, 2]])
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
     turn = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
-    assert np.abs(edge_strain(points @ turn.T + 5, faces, flat)).max() < 1e-12
-    np.testing.assert_allclose(edge_strain(1.1 * points, faces, flat), 0.1)
+    assert np.abs(edge_strain(points @ turn.T + 5, faces, lengths)).max() < 1e-12
+    np.testing.assert_allclose(edge_strain(1.1 * points, faces, lengths), 0.1)
+
+
+def test_strain_is_that_of_the_pattern_as_graded_to_the_wearer(
+    shot: SyntheticShot, chunk: FrameChunk
+) -> None:
+    """Cloth a quarter larger than drawn is strained, unless its pattern was drawn anew for a larger body."""
+    vest, count = shot.scene.layers[0], len(chunk.frames)
+    rest = np.repeat(vest.garment.rest_vertices[None].astype(np.float32), count, axis=0)
+    graded = replace(vest, graded_lengths=1.25 * vest.flat_lengths)
+    for layer, size, strain in ((vest, 1, 0), (vest, 1.25, 0.25), (graded, 1.25, 0), (graded, 1, 0.2)):
+        meter = FrameMeter(replace(shot.scene, layers=(layer,)))
+        figures = meter.measure(_with_layers(chunk, np.float32(size) * rest), 0)
+        assert figures["final/L00_vest/strain_p99"] == pytest.approx(strain, abs=0.01)
 
 
 def test_a_face_folded_over_its_neighbours_is_counted(shot: SyntheticShot, chunk: FrameChunk) -> None:

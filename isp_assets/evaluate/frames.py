@@ -10,12 +10,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from isp_assets.errors import GeometryError
 from isp_assets.frames import FrameChunk, Layer, Scene
 from isp_assets.geometry.closest import SurfaceTopology
 from isp_assets.geometry.folds import folded_faces
+from isp_assets.geometry.grading import edge_strain
 from isp_assets.geometry.intersection import Beneath, Intersection, measure_intersection
 from isp_assets.geometry.topology import hinges
 
@@ -30,7 +31,7 @@ FIGURES: dict[str, str] = {
     "inner_crossing_pairs": "pairs of triangles that cross, with all inner layers",
     "crossing_pairs": "pairs of triangles that cross, with anything beneath",
     "deepest_mm": "largest avoidable depth on the wrong side of anything beneath [mm]",
-    "strain_p99": "99th percentile of the relative change of edge lengths against the flat panels",
+    "strain_p99": "99th percentile of the relative change of edge lengths against the panels as graded",
     "flipped_faces": "faces that point against the mean of their neighbours",
 }
 """What each figure means."""
@@ -108,16 +109,6 @@ def summarise(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, dict[str
     return summary
 
 
-def edge_strain(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], corner_xy: Float[np.ndarray, "F 3 2"]
-) -> Float[np.ndarray, " E"]:
-    """Relative change of length of every face's edges against its flat panel (an inner edge counts twice)."""
-    corner = vertices[faces]
-    length = np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=-1)
-    flat = np.linalg.norm(corner_xy - np.roll(corner_xy, -1, axis=1), axis=-1)
-    return (length / flat - 1).reshape(-1)
-
-
 class _LayerMeter:
     """Static data of one layer."""
 
@@ -125,12 +116,12 @@ class _LayerMeter:
         garment = layer.garment
         self.name = layer.name
         self.topology = SurfaceTopology.build(garment.faces, garment.num_vertices)
-        self.corner_xy = garment.corner_xy
+        self.lengths = layer.flat_lengths
         self.pairs = hinges(garment.faces).faces
 
     def shape_figures(self, vertices: Float[np.ndarray, "V 3"]) -> dict[str, float]:
         faces = self.topology.faces
-        strain = np.abs(edge_strain(vertices, faces, self.corner_xy))
+        strain = np.abs(edge_strain(vertices, faces, self.lengths))
         return {
             "strain_p99": float(np.percentile(strain, 99)),
             "flipped_faces": float(folded_faces(vertices, faces, self.pairs).sum()),

@@ -9,8 +9,9 @@ pattern. Positions are in metres; functions are pure and differentiable.
 
 from dataclasses import replace
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from isp_assets.geometry.energy import ClothRest
@@ -45,6 +46,28 @@ def face_strain(vertices: Float[Tensor, "T V 3"], rest: ClothRest) -> Float[Tens
     )
     spread = (half.square() + metric[..., 0, 1].square()).sqrt()
     return torch.maximum((middle + spread).sqrt() - 1, 1 - (middle - spread).clamp_min(0).sqrt())
+
+
+def edge_lengths(rest: ClothRest) -> Float[np.ndarray, "F 3"]:
+    """Flat lengths of every face's edges, from each corner to the next [m]."""
+    flat = np.linalg.inv(rest.inverse_rest.cpu().double().numpy())
+    sides = np.stack([flat[..., 0], flat[..., 1] - flat[..., 0], -flat[..., 1]], axis=1)
+    return np.linalg.norm(sides, axis=-1)
+
+
+def edge_strain(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], lengths: Float[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Relative change of length of every face's edges (an inner edge counts twice).
+
+    Args:
+        vertices: Positions [m].
+        faces: Triangles.
+        lengths: Flat lengths from each corner to the next [m].
+    """
+    corner = vertices[faces]
+    sides = np.roll(corner, -1, axis=1) - corner
+    return np.sqrt(np.einsum("fkc,fkc->fk", sides, sides)) / lengths - 1
 
 
 def _flat_edges(corner: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 2 2"]:

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from isp_assets.conventions import GRAVITY
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.energy import ClothRest, Fabric
+from isp_assets.geometry.grading import edge_lengths, edge_strain
 from isp_assets.geometry.obstacle import ARMS, CollisionMesh, Obstacle
 from isp_assets.geometry.stretch import deformation_gradient
 
@@ -96,17 +97,12 @@ class ElasticCloth:
             csc_array(stiffness + diags_array(damping)),
             permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True},
         )  # fmt: skip
-        flat = np.linalg.inv(inverse)
-        sides = np.stack([flat[..., 0], flat[..., 1] - flat[..., 0], -flat[..., 1]], axis=1)
-        lengths = np.linalg.norm(sides, axis=-1)
+        lengths = edge_lengths(rest)
         return cls(fabric, gradient, weighted, area, bending, mass, ~held, faces, lengths, solver)
 
     def strain_p99(self, vertices: Float[np.ndarray, "V 3"]) -> float:
         """99th percentile of the relative change of edge lengths."""
-        corner = vertices[self.faces]
-        sides = np.roll(corner, -1, axis=1) - corner
-        lengths = np.sqrt(np.einsum("fkc,fkc->fk", sides, sides))
-        return float(np.percentile(np.abs(lengths / self.flat_lengths - 1), 99))
+        return float(np.percentile(np.abs(edge_strain(vertices, self.faces, self.flat_lengths)), 99))
 
     def energy(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[float, Float[np.ndarray, "V 3"]]:
         """Membrane, bending and gravity together [J], and the gradient [N]; see `geometry.energy`."""
