@@ -23,6 +23,7 @@ from isp_assets.geometry.relaxation import apart_from_arms, relax
 
 _STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
 
+_RELAXINGS = (6, 3)  # rounds; the second evens out what clearing lifted after the first
 _GENTLE = ProjectionOptions(rounds=3, ease=0, gentle=True)
 
 Obstacles = Sequence[Sequence[Obstacle]]
@@ -74,14 +75,18 @@ def _relaxed(
     share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
     if share == 0:
         return None
-    mesh = replace(worn.collision, parts=cloth.parts)
-    goal = relax(done.vertices, worn.elastic, mesh, beneath)
-    position = done.vertices + share * (goal - done.vertices)
-    own = apart_from_arms(cloth.parts)
-    clear = project(position, worn.collision, beneath, _GENTLE, parts=own)
-    if worn.elastic.strain_p99(clear.vertices) >= strain:
-        return None  # a body that cuts itself this deeply leaves no room for the state that was found
-    return replace(clear, tight=done.tight | clear.tight, pressed=done.pressed | clear.pressed)
+    mesh, own = replace(worn.collision, parts=cloth.parts), apart_from_arms(cloth.parts)
+    best, position = None, done.vertices
+    for rounds in _RELAXINGS:
+        goal = relax(position, worn.elastic, mesh, beneath, rounds=rounds)
+        clear = project(position + share * (goal - position), worn.collision, beneath, _GENTLE, parts=own)
+        position, reached = clear.vertices, worn.elastic.strain_p99(clear.vertices)
+        # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
+        if reached < strain:
+            best, strain = clear, reached
+    if best is None:
+        return None
+    return replace(best, tight=done.tight | best.tight, pressed=done.pressed | best.pressed)
 
 
 @dataclass

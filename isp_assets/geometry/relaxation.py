@@ -27,8 +27,6 @@ from isp_assets.geometry.grading import edge_lengths, edge_strain
 from isp_assets.geometry.obstacle import ARMS, CollisionMesh, Obstacle
 from isp_assets.geometry.stretch import deformation_gradient
 
-ROUNDS, STEPS = 6, 5
-"""Times that the nearest skin is looked up, and steps after each."""
 _CONTACT = 2e6  # stiffness of contact per mass [1/s²]
 _ABOVE = 0.001  # asked for on top of the margin [m]: a penalty gives way a little
 _NEAR = 0.02  # cloth further than this above its margin [m] meets no skin in a few steps
@@ -130,8 +128,8 @@ def relax(
     mesh: CollisionMesh,
     beneath: Sequence[Obstacle],
     *,
-    rounds: int = ROUNDS,
-    steps: int = STEPS,
+    rounds: int = 6,
+    steps: int = 5,
 ) -> Float[np.ndarray, "V 3"]:
     """Lower the energy of a garment where it lies on the skin; what lies on a layer stays.
 
