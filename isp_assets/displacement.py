@@ -13,14 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import DrapeError
 from isp_assets.garment import Garment
 from isp_assets.garment_model import GarmentModel
-from isp_assets.geometry.geodesic import distance_along
 from isp_assets.geometry.panel_map import PanelSampler
+from isp_assets.geometry.topology import edges
 from isp_assets.networks.drape_field import DrapeField
 
 ANCHOR_RAMP = 0.03
@@ -56,7 +58,11 @@ def anchor_ramp(garment: Garment, *, length: float = ANCHOR_RAMP) -> Float[np.nd
     """0 at anchored vertices, rising to 1 at ``length`` [m] along the cloth. All 1 without anchors."""
     if len(garment.anchors) == 0:
         return np.ones(garment.num_vertices, np.float32)
-    distance = distance_along(garment.rest_vertices, garment.faces, garment.anchors, limit=length)
+    start, end = edges(garment.faces).vertices.T
+    size = np.linalg.norm(garment.rest_vertices[start] - garment.rest_vertices[end], axis=1)
+    # A zero weight would mean "no edge".
+    graph = coo_array((np.maximum(size, 1e-9), (start, end)), shape=(garment.num_vertices,) * 2).tocsr()
+    distance = dijkstra(graph, directed=False, indices=garment.anchors, min_only=True, limit=length)
     t = np.clip(np.where(np.isfinite(distance), distance, length) / length, 0, 1)
     return (t * t * (3 - 2 * t)).astype(np.float32)
 

@@ -34,7 +34,7 @@ from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
 from isp_assets.geometry.projection import BODY_MARGIN, LAYER_MARGIN, Projection, ProjectionOptions
 from isp_assets.layering import correct_layer
 from isp_assets.outfit import Outfit
-from isp_assets.shot import DEFAULT_RESOLUTION, DEFAULT_TUCK_DEPTH, Shot
+from isp_assets.shot import DEFAULT_RESOLUTION, Shot
 from isp_assets.skinning import skin_garment
 from isp_assets.tucking import Tucking
 
@@ -49,8 +49,6 @@ class DrapeOptions:
     """Rungs to run; ``skin`` is always needed."""
     resolution: int = DEFAULT_RESOLUTION
     """Grid cells across a panel, 32 to 512."""
-    tuck_depth: float | None = DEFAULT_TUCK_DEPTH
-    """How far tucked cloth is kept beneath a waistband [m]; what is deeper, nobody sees. None keeps all."""
     chunk: int = 8
     """Frames held at once."""
     device: str = "cpu"
@@ -73,8 +71,6 @@ class DrapeOptions:
             )
         if not 0 <= self.smoothing < 1:
             raise DrapeError(f"smoothing must be at least 0 and below 1, got {self.smoothing:g}")
-        if self.tuck_depth is not None and not self.tuck_depth >= 0:
-            raise DrapeError(f"tuck_depth must be at least 0 m, or None, got {self.tuck_depth:g}")
         if self.chunk < 1:
             raise DrapeError(f"chunk must be at least 1 frame, got {self.chunk}")
 
@@ -126,10 +122,7 @@ class Draper:
         self.shot, self.options = shot, options
         self.body = shot.body.to(options.device)
         self.betas = torch.as_tensor(shot.betas, dtype=torch.float32, device=options.device)
-        worn = dress(
-            outfit, self.body, self.betas,
-            resolution=options.resolution, device=options.device, tuck_depth=options.tuck_depth,
-        )  # fmt: skip
+        worn = dress(outfit, self.body, self.betas, resolution=options.resolution, device=options.device)
         self.body_collision = CollisionMesh.build(shot.body.faces.numpy(), shot.body.weights.numpy())
         self.tucking = self._tucking(worn) if "tuck" in options.steps and len(worn) > 1 else None
         self.worn = self.tucking.worn if self.tucking else worn
@@ -155,8 +148,9 @@ class Draper:
     def _tucking(self, worn: tuple[WornGarment, ...]) -> Tucking:
         """Find what is tucked in at rest."""
         posed = self.body.pose(torch.zeros(1, NUM_JOINTS, 3, device=self.options.device), betas=self.betas)
+        rest = [skin_garment(garment.skin, posed, self.betas)[0][0] for garment in worn]
         skin = Obstacle(self.body_collision, posed.vertices[0].cpu().numpy(), margin=self.options.body_margin)
-        return Tucking(worn, [garment.rest for garment in worn], skin)
+        return Tucking(worn, [vertices.cpu().numpy().astype(np.float64) for vertices in rest], skin)
 
     @torch.no_grad()
     def chunk(self, rows: slice) -> FrameChunk:

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from isp_assets.bake import bake_texture
-from isp_assets.body import Body, PosedBody
-from isp_assets.conventions import NUM_JOINTS
+from isp_assets.body import Body
 from isp_assets.decode import decode_garment
 from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displacement, panel_sampler
 from isp_assets.frames import Layer
@@ -27,8 +26,7 @@ from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField
 from isp_assets.networks.placement import on_device
 from isp_assets.outfit import Outfit, OutfitItem
-from isp_assets.skinning import BoundGarment, bind, shape_garment, skin_garment
-from isp_assets.trimming import Piece, trim_tucked
+from isp_assets.skinning import BoundGarment, bind, shape_garment
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +35,6 @@ class WornGarment:
 
     layer: Layer
     code: Float[Tensor, " Z"]
-    rest: Float[np.ndarray, "V 3"]
-    """Skinned to the wearer in T-pose [m]."""
     faces: Int[Tensor, "F 3"]
     skin: BoundGarment
     field: DrapeField | None
@@ -52,13 +48,7 @@ class WornGarment:
 
 
 def dress(
-    outfit: Outfit,
-    body: Body,
-    betas: Float[Tensor, " B"],
-    *,
-    resolution: int,
-    device: str = "cpu",
-    tuck_depth: float | None = None,
+    outfit: Outfit, body: Body, betas: Float[Tensor, " B"], *, resolution: int, device: str = "cpu"
 ) -> tuple[WornGarment, ...]:
     """Decode and bind every garment of an outfit, innermost first.
 
@@ -68,35 +58,24 @@ def dress(
         betas: The wearer's shape, on ``device``; patterns are graded to it.
         resolution: Grid cells across a panel; see `decode_garment`.
         device: Where the networks run.
-        tuck_depth: How far tucked cloth is kept [m], see `trim_tucked`; None keeps all.
 
     Raises:
         DecodeError: If a code gives no valid garment.
         DrapeError: If the skin field does not fit the body.
     """
-    standing = body.pose(torch.zeros(1, NUM_JOINTS, 3, device=betas.device), betas=betas)
-    pieces = tuple(
-        _bound(item, outfit, body, standing, betas, resolution=resolution, device=device) for item in outfit
+    return tuple(
+        _wear(outfit, index, body, betas, resolution=resolution, device=device)
+        for index in range(len(outfit))
     )
-    if tuck_depth is not None:
-        pieces = trim_tucked(pieces, depth=tuck_depth)
-    return tuple(_wear(outfit, index, piece, betas, device=device) for index, piece in enumerate(pieces))
 
 
 @torch.no_grad()
-def _bound(
-    item: OutfitItem, outfit: Outfit, body: Body, standing: PosedBody, betas: Tensor, *,
-    resolution: int, device: str,
-) -> Piece:  # fmt: skip
+def _wear(
+    outfit: Outfit, index: int, body: Body, betas: Tensor, *, resolution: int, device: str
+) -> WornGarment:
+    item = outfit.items[index]
     garment = decode_garment(item.bundle.model, item.code, resolution=resolution, name=item.name)
     skin = bind(garment, body, on_device(outfit.skin.skin_field, device))
-    rest = skin_garment(skin, standing, betas)[0][0]
-    return Piece(garment, skin, rest.cpu().numpy().astype(np.float64))
-
-
-@torch.no_grad()
-def _wear(outfit: Outfit, index: int, piece: Piece, betas: Tensor, *, device: str) -> WornGarment:
-    item, garment, skin = outfit.items[index], piece.garment, piece.skin
     fabric = Fabric()
     flat = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, fabric)
     graded = graded_rest(flat.to(device, torch.float32), skin.canonical, shape_garment(skin, betas))
@@ -107,16 +86,15 @@ def _wear(outfit: Outfit, index: int, piece: Piece, betas: Tensor, *, device: st
         sampler = panel_sampler(garment, item.bundle.model, resolution=field.config.map_size)
         displacement = bind_displacement(field, sampler.to(device), ramp)
     return WornGarment(
-        layer=_layer(outfit.layer_name(index), piece, item, edge_lengths(graded)),
+        layer=_layer(outfit.layer_name(index), garment, item, edge_lengths(graded)),
         code=torch.as_tensor(item.code, device=device),
-        rest=piece.rest,
         faces=torch.as_tensor(garment.faces, device=device),
         skin=skin,
         field=field,
         displacement=displacement,
         layering=_layering(outfit, garment, item, device),
         ramp=torch.as_tensor(ramp, device=device),
-        collision=piece.collision,
+        collision=CollisionMesh.build(garment.faces, skin.joint_weights.cpu().numpy()),
         stretch=StretchLimit.build(graded, held=ramp == 0),
         elastic=ElasticCloth.build(graded, fabric, held=ramp == 0),
     )
@@ -130,6 +108,6 @@ def _layering(outfit: Outfit, garment: Garment, item: OutfitItem, device: str) -
     return bind_layering(network, garment, sampler, device=device)
 
 
-def _layer(name: str, piece: Piece, item: OutfitItem, lengths: Float[np.ndarray, "F 3"]) -> Layer:
-    texture = np.ascontiguousarray(bake_texture(piece.garment, item.style))
-    return Layer(name, piece.garment, texture, item.style.color, piece.trimmed, lengths)
+def _layer(name: str, garment: Garment, item: OutfitItem, lengths: Float[np.ndarray, "F 3"]) -> Layer:
+    texture = np.ascontiguousarray(bake_texture(garment, item.style))
+    return Layer(name, garment, texture, item.style.color, lengths)

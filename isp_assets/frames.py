@@ -25,8 +25,6 @@ class Layer:
     """sRGB image over `Garment.st`; row 0 is the top (t = 1)."""
     color: tuple[float, float, float]
     """Display colour, sRGB in 0..1."""
-    trimmed: float = 0.0
-    """Share of its cloth that was cut off, because it is tucked in too deep to be seen."""
     graded_lengths: Float[np.ndarray, "F 3"] | None = None
     """Flat lengths of every face's edges, from each corner to the next, once its pattern is graded to the
     wearer [m]; None if it is worn as drawn."""

@@ -6,10 +6,10 @@ lengths, texture coordinates and the sewn surface stay consistent by constructio
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from isp_assets.conventions import PANELS
 from isp_assets.errors import GarmentError
@@ -28,8 +28,7 @@ class Panel:
     st: Float[np.ndarray, "P 2"]
     """Texture coordinates in 0..1; the two panels do not overlap in the texture."""
     border_label: Int[np.ndarray, " P"]
-    """Edge label of a border point, 0 for an interior point. A corner carries that of the edge it starts.
-    A border where cloth was cut off has no label."""
+    """Edge label of a border point, 0 for an interior point. A corner carries that of the edge it starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,53 +130,3 @@ class Garment:
         """Row of ``st`` for every face corner."""
         offset = len(self.panels["front"].panel_xy)
         return np.concatenate([p.faces + k * offset for k, p in enumerate(self.panels.values())])
-
-    def with_faces(self, kept: Bool[np.ndarray, " F"]) -> tuple["Garment", Int[np.ndarray, " W"]]:
-        """The garment with some of its faces only.
-
-        Points on the border that this makes keep their labels: 0 where they were inside.
-
-        Args:
-            kept: Faces that stay, in the order of ``faces``.
-
-        Returns:
-            The garment, and which vertices it has, in their old order.
-
-        Raises:
-            GarmentError: If no face stays.
-        """
-        if not kept.any():
-            raise GarmentError(f"garment {self.name!r}: no face is left")
-        vertices = np.unique(self.faces[kept])
-        number = np.full(self.num_vertices, -1)
-        number[vertices] = np.arange(len(vertices))
-        panels, points = {}, {}
-        per_panel = np.split(kept, [len(self.panels[PANELS[0]].faces)])
-        for (side, panel), stays in zip(self.panels.items(), per_panel, strict=True):
-            index = np.unique(panel.faces[stays])
-            points[side] = np.full(len(panel.panel_xy), -1)
-            points[side][index] = np.arange(len(index))
-            panels[side] = Panel(
-                panel.panel_xy[index], points[side][panel.faces[stays]], number[panel.vertex_index[index]],
-                panel.st[index], panel.border_label[index],
-            )  # fmt: skip
-        seams = [part for seam in self.seams for part in _sewn_still(seam, points)]
-        anchors = number[self.anchors]
-        garment = replace(
-            self, rest_vertices=self.rest_vertices[vertices], panels=panels, seams=tuple(seams),
-            anchors=anchors[anchors >= 0],
-        )  # fmt: skip
-        return garment, vertices
-
-
-def _sewn_still(seam: Seam, points: Mapping[str, Int[np.ndarray, " _"]]) -> list[Seam]:
-    """What is left of a seam, cut where points are gone.
-
-    Args:
-        seam: The whole seam.
-        points: New number of every point of each panel, -1 where it is gone.
-    """
-    front, back = (points[side][index] for side, index in zip(PANELS, (seam.front, seam.back), strict=True))
-    there = (front >= 0) & (back >= 0)
-    runs = np.split(np.arange(len(there)), np.flatnonzero(there[1:] != there[:-1]) + 1)
-    return [Seam(seam.labels, front[run], back[run]) for run in runs if there[run[0]] and len(run) > 1]

@@ -65,7 +65,7 @@ def run_job(
     clock: dict[str, float] = {}
     paths = {name: out / f"{job.shot.name}{writer.suffix}" for name, writer in writers.items()}
     _check_paths(paths)
-    options = replace(options, resolution=job.resolution, tuck_depth=job.tuck_depth, keep_stages=True)
+    options = replace(options, resolution=job.resolution, keep_stages=True)
     draped, store = _draped(job, options, out, workers=workers, resume=resume)
     clock["prepare"] = time.perf_counter() - started
     out.mkdir(parents=True, exist_ok=True)
@@ -220,7 +220,6 @@ def _layer_row(layer: Any) -> dict[str, Any]:
         "category": garment.category,
         "vertices": garment.num_vertices,
         "faces": len(garment.faces),
-        "trimmed_percent": round(100 * layer.trimmed, 2),
         "seams": len(garment.seams),
     }
 

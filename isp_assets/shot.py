@@ -11,7 +11,6 @@
     body = "default"                # or an SMPL-format .npz or .pkl
     betas = "neutral"               # a preset, or a list of numbers
     resolution = 96                 # grid cells across a panel
-    tuck_depth = 0.05               # metres of a tucked hem that are kept beneath a waistband; "all" keeps it
     write = ["usd", "glb", "rerun", "sheet"]
 """
 
@@ -33,13 +32,11 @@ from isp_assets.toml_file import check_keys, read_toml
 
 MIN_RESOLUTION, MAX_RESOLUTION = 32, 512
 DEFAULT_RESOLUTION = 96
-DEFAULT_TUCK_DEPTH = 0.05
-"""How far beneath the border of its cover tucked cloth is kept [m]."""
 DEFAULT_WRITERS = ("usd", "glb", "rerun", "sheet")
 
 _KEYS = {
     "name": str, "collection": str, "body": str, "betas": (str, list), "motion": str, "frames": (str, int),
-    "fps": (int, float), "outfit": list, "resolution": int, "tuck_depth": (int, float, str), "write": list,
+    "fps": (int, float), "outfit": list, "resolution": int, "write": list,
 }  # fmt: skip
 
 
@@ -70,8 +67,6 @@ class ShotJob:
     shot: Shot
     outfit: Outfit
     resolution: int = DEFAULT_RESOLUTION
-    tuck_depth: float | None = DEFAULT_TUCK_DEPTH
-    """How far tucked cloth is kept beneath a waistband [m]; None keeps all."""
     write: tuple[str, ...] = DEFAULT_WRITERS
 
     def __post_init__(self) -> None:
@@ -115,8 +110,7 @@ class ShotJob:
             raise ShotError(f"{where}: name must be usable as a file name, got {name!r}")
         shot = Shot(name, body, motion, _betas(table.get("betas", "neutral"), where))
         write = tuple(table.get("write", DEFAULT_WRITERS))
-        depth = _tuck_depth(table.get("tuck_depth", DEFAULT_TUCK_DEPTH), where)
-        return cls(shot, outfit, table.get("resolution", DEFAULT_RESOLUTION), depth, write)
+        return cls(shot, outfit, table.get("resolution", DEFAULT_RESOLUTION), write)
 
 
 def _source(text: str, builtin: tuple[str, ...], folder: Path) -> str | Path:
@@ -135,14 +129,6 @@ def _motion(table: Mapping[str, Any], folder: Path, frames: FrameRange | None) -
         else None
     )
     return motion if wanted is None else motion.select(wanted)
-
-
-def _tuck_depth(value: float | str, where: str) -> float | None:
-    if value == "all":
-        return None
-    if isinstance(value, (str, bool)) or not 0 <= value < float("inf"):
-        raise ShotError(f'{where}: tuck_depth must be a length >= 0 in metres, or "all"; got {value!r}')
-    return float(value)
 
 
 def _betas(value: str | list[Any], where: str) -> Float[np.ndarray, " B"]:

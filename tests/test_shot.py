@@ -29,12 +29,11 @@ def test_defaults(tmp_path: Path) -> None:
 
 def test_every_key(tmp_path: Path) -> None:
     text = GOOD + 'name = "a"\nframes = "3-9x2"\nbetas = [1, -0.5]\nresolution = 64\nwrite = ["usd"]\n'
-    text += 'tuck_depth = "all"\n'
     job = load(tmp_path, text)
     assert job.shot.name == "a"
     assert job.shot.motion.frames.tolist() == [3, 5, 7, 9]
     assert job.shot.betas.tolist() == [1.0, -0.5]
-    assert (job.resolution, job.tuck_depth, job.write) == (64, None, ("usd",))
+    assert (job.resolution, job.write) == (64, ("usd",))
 
 
 def test_command_line_frames_override_the_file(tmp_path: Path) -> None:
@@ -67,9 +66,6 @@ def test_paths_start_at_the_file(tmp_path: Path) -> None:
         ('motion = "walk"\n', "missing key outfit"),
         (GOOD + "colour = 1\n", "unknown key 'colour'"),
         (GOOD + "resolution = 8\n", r"resolution must lie in 32\.\.512, got 8"),
-        (GOOD + 'tuck_depth = "none"\n', 'tuck_depth must be a length >= 0 in metres, or "all"'),
-        (GOOD + "tuck_depth = -0.1\n", "tuck_depth must be a length"),
-        (GOOD + "tuck_depth = inf\n", "tuck_depth must be a length"),
         (GOOD + 'betas = "giant"\n', "betas must be a list of numbers or one of"),
         (GOOD + 'betas = [1, "a"]\n', "betas must be numbers"),
         (GOOD + f"betas = {[0.0] * 11}\n", "has 10 betas, got 11"),

@@ -236,10 +236,7 @@ def _calmed(
 
 def _worn(case: StressCase) -> tuple[WornGarment, ...]:
     betas = torch.as_tensor(case.shot.betas, dtype=torch.float32)
-    options = case.options
-    return dress(
-        case.outfit, case.shot.body, betas, resolution=options.resolution, tuck_depth=options.tuck_depth
-    )
+    return dress(case.outfit, case.shot.body, betas, resolution=case.options.resolution)
 
 
 def _body_collision(case: StressCase) -> CollisionMesh:
