@@ -79,14 +79,16 @@ def _relaxed(
     best, position = None, done.vertices
     for rounds in _RELAXINGS:
         goal = relax(position, worn.elastic, mesh, beneath, rounds=rounds)
-        clear = project(position + share * (goal - position), worn.collision, beneath, _GENTLE, parts=own)
+        clear = project(goal, worn.collision, beneath, _GENTLE, parts=own)
         position, reached = clear.vertices, worn.elastic.strain_p99(clear.vertices)
         # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
         if reached < strain:
             best, strain = clear, reached
     if best is None:
         return None
-    return replace(best, tight=done.tight | best.tight, pressed=done.pressed | best.pressed)
+    # What lies between two states that are clear, and near to one another, is clear as well.
+    between = done.vertices + share * (best.vertices - done.vertices)
+    return replace(best, vertices=between, tight=done.tight | best.tight, pressed=done.pressed | best.pressed)
 
 
 @dataclass

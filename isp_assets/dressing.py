@@ -96,7 +96,7 @@ def _wear(
         ramp=torch.as_tensor(ramp, device=device),
         collision=CollisionMesh.build(garment.faces, skin.joint_weights.cpu().numpy()),
         stretch=StretchLimit.build(graded, held=ramp == 0),
-        elastic=ElasticCloth.build(graded, fabric, held=ramp == 0),
+        elastic=ElasticCloth(graded, fabric, free=ramp > 0),
     )
 
 

@@ -45,7 +45,7 @@ def _rest() -> ClothRest:
 
 def _cloth(held: np.ndarray | None = None) -> ElasticCloth:
     none = np.zeros(len(SHAPE[0]), bool)
-    return ElasticCloth.build(_rest(), FABRIC, held=none if held is None else held)
+    return ElasticCloth(_rest(), FABRIC, free=~(none if held is None else held))
 
 
 def _bunched() -> np.ndarray:

@@ -14,6 +14,7 @@ Hyperelastic Materials", ACM Transactions on Graphics 36(3), 2017.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -48,55 +49,62 @@ Energy = Callable[[Float[np.ndarray, "V 3"]], tuple[float, Float[np.ndarray, "V 
 
 @dataclass(frozen=True, eq=False)
 class ElasticCloth:
-    """The energy of one garment of V vertices; static over frames."""
+    """The energy of one garment of V vertices; its matrices are made when first needed, and kept."""
 
+    rest: ClothRest
+    """Its flat state, graded to the body."""
     fabric: Fabric
-    gradient: csr_array
-    """[2 F, V]: positions to the two columns of every face's deformation gradient."""
-    weighted: csr_array
-    """[V, 2 F]: its transpose, faces weighted by their flat areas."""
-    area: Float[np.ndarray, " F"]
-    bending: csr_array
-    """[V, V]: the constant Hessian of the bending energy [N/m]."""
-    mass: Float[np.ndarray, " V"]
     free: Bool[np.ndarray, " V"]
     """Vertices that the body does not hold."""
-    faces: Int[np.ndarray, "F 3"]
-    flat_lengths: Float[np.ndarray, "F 3"]
-    """Flat lengths of every face's edges, from each corner to the next [m]."""
-    solver: SuperLU
 
-    @classmethod
-    def build(cls, rest: ClothRest, fabric: Fabric, *, held: Bool[np.ndarray, " V"]) -> "ElasticCloth":
-        """Factor the matrix of a garment.
+    @cached_property
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        return self.rest.faces.cpu().numpy()
 
-        Args:
-            rest: Its flat state, graded to the body.
-            fabric: Material constants.
-            held: Vertices that must not move.
-        """
-        faces = rest.faces.cpu().numpy()
-        inverse, area, mass, weights, hinge_area = (
-            part.cpu().double().numpy()
-            for part in (rest.inverse_rest, rest.area, rest.mass, rest.hinge_weights, rest.hinge_area)
+    @cached_property
+    def flat_lengths(self) -> Float[np.ndarray, "F 3"]:
+        """Flat lengths of every face's edges, from each corner to the next [m]."""
+        return edge_lengths(self.rest)
+
+    @cached_property
+    def area(self) -> Float[np.ndarray, " F"]:
+        return self.rest.area.cpu().double().numpy()
+
+    @cached_property
+    def mass(self) -> Float[np.ndarray, " V"]:
+        return self.rest.mass.cpu().double().numpy()
+
+    @cached_property
+    def gradient(self) -> csr_array:
+        """[2 F, V]: positions to the two columns of every face's deformation gradient."""
+        return deformation_gradient(self.faces, self.rest.inverse_rest.cpu().double().numpy(), len(self.free))
+
+    @cached_property
+    def weighted(self) -> csr_array:
+        """[V, 2 F]: its transpose, faces weighted by their flat areas."""
+        return (self.gradient.T @ diags_array(np.repeat(self.area, 2))).tocsr()
+
+    @cached_property
+    def bending(self) -> csr_array:
+        """[V, V]: the constant Hessian of the bending energy [N/m]."""
+        hinge, weights, area = (
+            part.cpu().numpy() for part in (self.rest.hinges, self.rest.hinge_weights, self.rest.hinge_area)
         )
-        gradient = deformation_gradient(faces, inverse, len(held))
-        weighted = (gradient.T @ diags_array(np.repeat(area, 2))).tocsr()
-        hinge = rest.hinges.cpu().numpy()
         row = np.broadcast_to(np.arange(len(hinge))[:, None], hinge.shape)
-        across = coo_array(
-            (weights.ravel(), (row.ravel(), hinge.ravel())), shape=(len(hinge), len(held))
-        ).tocsr()
-        bending = (across.T @ diags_array(3 * fabric.bending / hinge_area) @ across).tocsr()
-        stiffness = (2 * fabric.mu + fabric.lam) * (weighted @ gradient) + bending
+        entries = weights.astype(np.float64).ravel(), (row.ravel(), hinge.ravel())
+        across = coo_array(entries, shape=(len(hinge), len(self.free))).tocsr()
+        return (across.T @ diags_array(3 * self.fabric.bending / area.astype(np.float64)) @ across).tocsr()
+
+    @cached_property
+    def solver(self) -> SuperLU:
+        """The factored matrix of projective dynamics: that of cloth without strain, damped."""
+        stiffness = (2 * self.fabric.mu + self.fabric.lam) * (self.weighted @ self.gradient) + self.bending
         diagonal = stiffness.diagonal()
-        damping = np.where(held, _HELD * diagonal.max(), _DAMPING * diagonal)
-        solver = splu(
+        damping = np.where(self.free, _DAMPING * diagonal, _HELD * diagonal.max())
+        return splu(
             csc_array(stiffness + diags_array(damping)),
             permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True},
         )  # fmt: skip
-        lengths = edge_lengths(rest)
-        return cls(fabric, gradient, weighted, area, bending, mass, ~held, faces, lengths, solver)
 
     def strain_p99(self, vertices: Float[np.ndarray, "V 3"]) -> float:
         """99th percentile of the relative change of edge lengths."""
