@@ -78,7 +78,7 @@ def _relaxed(
     mesh, own = replace(worn.collision, parts=cloth.parts), apart_from_arms(cloth.parts)
     best, position = None, done.vertices
     for rounds in _RELAXINGS:
-        goal = relax(position, worn.elastic, mesh, beneath, rounds=rounds)
+        goal = relax(position, worn.elastic, mesh, beneath, still=worn.tucked, rounds=rounds)
         clear = project(goal, worn.collision, beneath, _GENTLE, parts=own)
         position, reached = clear.vertices, worn.elastic.strain_p99(clear.vertices)
         # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.

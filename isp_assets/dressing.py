@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from isp_assets.bake import bake_texture
@@ -45,6 +45,8 @@ class WornGarment:
     collision: CollisionMesh
     stretch: StretchLimit
     elastic: ElasticCloth
+    tucked: Bool[np.ndarray, " V"]
+    """Cloth that is hidden beneath another layer, which has no room for it; see `tucking`."""
 
 
 def dress(
@@ -97,6 +99,7 @@ def _wear(
         collision=CollisionMesh.build(garment.faces, skin.joint_weights.cpu().numpy()),
         stretch=StretchLimit.build(graded, held=ramp == 0),
         elastic=ElasticCloth(graded, fabric, free=ramp > 0),
+        tucked=np.zeros(garment.num_vertices, bool),
     )
 
 

@@ -38,10 +38,14 @@ class Tucking:
             self._cover(garment, vertices, covers)
         self._hidden = tuple(reversed(hidden))
         self.worn = tuple(
-            replace(garment, stretch=garment.stretch.loosened((part.share > 0).astype(float)))
+            replace(
+                garment,
+                stretch=garment.stretch.loosened((part.share > 0).astype(float)),
+                tucked=part.share > 0,
+            )
             for garment, part in zip(worn, self._hidden, strict=True)
         )
-        """The layers, free to crumple where they are hidden."""
+        """The layers, told what of them is hidden, and free to crumple there."""
 
     def frame(self, layers: Sequence[Positions], body: Obstacle) -> list[Positions]:
         """The layers of one frame, tucked in; the same arrays where nothing is.

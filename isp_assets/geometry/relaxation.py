@@ -136,6 +136,7 @@ def relax(
     mesh: CollisionMesh,
     beneath: Sequence[Obstacle],
     *,
+    still: Bool[np.ndarray, " V"] | None = None,
     rounds: int = 6,
     steps: int = 5,
 ) -> Float[np.ndarray, "V 3"]:
@@ -146,6 +147,7 @@ def relax(
         cloth: Its energy.
         mesh: Its collision data, with the parts that its vertices belong to in this frame.
         beneath: The body, then every inner garment.
+        still: Further vertices that stay, such as those of a hem that was pressed flat.
         rounds: Times that the nearest skin is looked up.
         steps: Steps after each.
 
@@ -164,6 +166,8 @@ def relax(
     for layer in beneath[1:]:
         caught |= np.abs(layer.contacts(start, mesh.parts, within=_LAYERED).height) < _LAYERED
     stiffness = _CONTACT * cloth.mass
+    if still is not None:
+        caught |= still
     hold = (_HOLD * stiffness * caught)[:, None]
     for _ in range(rounds):
         planes = _Planes.nearest(position, own, skin, stiffness, concerned=~caught)
