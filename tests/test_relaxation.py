@@ -7,7 +7,7 @@ from collision_shapes import LEFT_ARM, collision, obstacle, tube
 
 from isp_assets.collection import Collection
 from isp_assets.conventions import FrameRange
-from isp_assets.drape import DrapeOptions, drape
+from isp_assets.drape import DrapeOptions, Draper, drape
 from isp_assets.dressing import dress
 from isp_assets.errors import GeometryError
 from isp_assets.evaluate import stress_motions
@@ -144,6 +144,16 @@ def test_cloth_that_an_arm_presses_on_stays_where_it_was_put() -> None:
     assert pressed[under].max() < 0.2 * free[under].max()
 
 
+def test_cloth_that_is_to_stay_still_stays() -> None:
+    start = _bunched()
+    still = np.abs(start[:, 1]) < 0.05
+    moved = [
+        np.linalg.norm(relax(start, _cloth(), collision(SHAPE), [_body()], still=part) - start, axis=1)
+        for part in (None, still)
+    ]
+    assert moved[1][still].max() < 0.2 * moved[0][still].max()
+
+
 def test_all_but_the_arms_count_as_one() -> None:
     parts = np.eye(6, dtype=bool)
     own = apart_from_arms(parts)
@@ -174,3 +184,18 @@ def test_a_deep_squat_is_relaxed_and_walking_is_left_alone() -> None:
     walk = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(50, 50)))
     (chunk,) = list(drape(outfit, walk, DrapeOptions(resolution=64)))
     assert "relax" not in chunk.steps[0][0]
+
+
+def test_a_tucked_hem_stays_where_it_was_pressed() -> None:
+    setup = StressSetup.load()
+    outfit = Collection.load().outfit(["long_sleeved_shirt", "trousers"])
+    squat = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [48.0]))
+    draper = Draper(outfit, squat, DrapeOptions(resolution=48, keep_stages=True))
+    chunk = draper.chunk(slice(0, 1))
+    tucked = draper.worn[0].tucked
+    moved = np.linalg.norm(chunk.layers[0][0] - chunk.stages["project"][0][0], axis=1)
+    assert "relax" in chunk.steps[0][0]
+    assert 0.05 < tucked.mean() < 0.4
+    assert not draper.worn[1].tucked.any()
+    assert np.percentile(moved[tucked], 90) < 0.004
+    assert moved[~tucked].max() > 0.006
