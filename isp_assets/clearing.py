@@ -17,12 +17,11 @@ from jaxtyping import Float
 from isp_assets.dressing import WornGarment
 from isp_assets.errors import DrapeError
 from isp_assets.geometry.buried import LaidCloth
-from isp_assets.geometry.obstacle import Obstacle
+from isp_assets.geometry.obstacle import Obstacle, apart_from_arms
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
-from isp_assets.geometry.relaxation import apart_from_arms, relax
+from isp_assets.geometry.relaxation import relax
 
 _STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
-
 _RELAXINGS = (6, 3)  # rounds; the second evens out what clearing lifted after the first
 _GENTLE = ProjectionOptions(rounds=3, ease=0, gentle=True)
 
@@ -86,7 +85,7 @@ def _relaxed(
             best, strain = clear, reached
     if best is None:
         return None
-    # What lies between two states that are clear, and near to one another, is clear as well.
+    # Both states keep their margins, and are near to one another: what lies between hardly uses them up.
     between = done.vertices + share * (best.vertices - done.vertices)
     return replace(best, vertices=between, tight=done.tight | best.tight, pressed=done.pressed | best.pressed)
 

@@ -18,7 +18,7 @@ from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displac
 from isp_assets.frames import Layer
 from isp_assets.garment import Garment
 from isp_assets.geometry.energy import Fabric, cloth_rest
-from isp_assets.geometry.grading import edge_lengths, graded_rest
+from isp_assets.geometry.grading import graded_rest
 from isp_assets.geometry.obstacle import CollisionMesh
 from isp_assets.geometry.relaxation import ElasticCloth
 from isp_assets.geometry.stretch import StretchLimit
@@ -82,13 +82,14 @@ def _wear(
     flat = cloth_rest(garment.faces, garment.corner_xy, garment.num_vertices, fabric)
     graded = graded_rest(flat.to(device, torch.float32), skin.canonical, shape_garment(skin, betas))
     ramp = anchor_ramp(garment)
+    elastic = ElasticCloth(graded, fabric, free=ramp > 0)
     field, displacement = item.bundle.drape_field, None
     if field is not None:
         field = on_device(field, device).eval()
         sampler = panel_sampler(garment, item.bundle.model, resolution=field.config.map_size)
         displacement = bind_displacement(field, sampler.to(device), ramp)
     return WornGarment(
-        layer=_layer(outfit.layer_name(index), garment, item, edge_lengths(graded)),
+        layer=_layer(outfit.layer_name(index), garment, item, elastic.flat_lengths),
         code=torch.as_tensor(item.code, device=device),
         faces=torch.as_tensor(garment.faces, device=device),
         skin=skin,
@@ -98,7 +99,7 @@ def _wear(
         ramp=torch.as_tensor(ramp, device=device),
         collision=CollisionMesh.build(garment.faces, skin.joint_weights.cpu().numpy()),
         stretch=StretchLimit.build(graded, held=ramp == 0),
-        elastic=ElasticCloth(graded, fabric, free=ramp > 0),
+        elastic=elastic,
         tucked=np.zeros(garment.num_vertices, bool),
     )
 

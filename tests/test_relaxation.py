@@ -20,8 +20,8 @@ from isp_assets.geometry.energy import (
     gravity_energy,
     membrane_energy,
 )
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
-from isp_assets.geometry.relaxation import ElasticCloth, apart_from_arms, relax
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
+from isp_assets.geometry.relaxation import ElasticCloth, relax
 from isp_assets.motion import Motion
 from isp_assets.shot import Shot
 

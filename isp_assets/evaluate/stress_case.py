@@ -16,7 +16,7 @@ from isp_assets.outfit import Outfit
 from isp_assets.shot import Shot
 
 BEFORE = "layering"
-"""The rung after which only projection is left."""
+"""The rung after which only projecting and relaxing are left."""
 
 
 @dataclass(frozen=True, eq=False)

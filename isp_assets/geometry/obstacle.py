@@ -51,6 +51,14 @@ def body_parts(
     return _by_weight(_part_weights(joint_weights))
 
 
+def apart_from_arms(parts: Bool[np.ndarray, "V 6"]) -> Bool[np.ndarray, "V 6"]:
+    """Parts that cloth may lie on: all but the arms as one, since cloth in a hip's crease lies on both."""
+    own = parts.copy()
+    rest = np.setdiff1d(np.arange(parts.shape[1]), ARMS)
+    own[:, rest] |= parts[:, rest].any(axis=1, keepdims=True)
+    return own
+
+
 def _by_weight(
     weight: Float[np.ndarray, "V 6"],
 ) -> tuple[Bool[np.ndarray, "V 6"], Bool[np.ndarray, "V 6"]]:

@@ -18,15 +18,15 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import SuperLU
 
 from isp_assets.conventions import GRAVITY
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.energy import ClothRest, Fabric
 from isp_assets.geometry.grading import edge_lengths, edge_strain
-from isp_assets.geometry.obstacle import ARMS, CollisionMesh, Obstacle
-from isp_assets.geometry.stretch import deformation_gradient
+from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
+from isp_assets.geometry.stretch import deformation_gradient, factored
 
 _CONTACT = 2e6  # stiffness of contact per mass [1/s²]
 _ABOVE = 0.001  # asked for on top of the margin [m]: a penalty gives way a little
@@ -101,10 +101,7 @@ class ElasticCloth:
         stiffness = (2 * self.fabric.mu + self.fabric.lam) * (self.weighted @ self.gradient) + self.bending
         diagonal = stiffness.diagonal()
         damping = np.where(self.free, _DAMPING * diagonal, _HELD * diagonal.max())
-        return splu(
-            csc_array(stiffness + diags_array(damping)),
-            permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True},
-        )  # fmt: skip
+        return factored(stiffness + diags_array(damping))
 
     def strain_p99(self, vertices: Float[np.ndarray, "V 3"]) -> float:
         """99th percentile of the relative change of edge lengths."""
@@ -181,14 +178,6 @@ def relax(
 
         position = _descend(position, energy, cloth, steps=steps)
     return position
-
-
-def apart_from_arms(parts: Bool[np.ndarray, "V 6"]) -> Bool[np.ndarray, "V 6"]:
-    """Parts that cloth may lie on: all but the arms as one, since cloth in a hip's crease lies on both."""
-    own = parts.copy()
-    rest = np.setdiff1d(np.arange(parts.shape[1]), ARMS)
-    own[:, rest] |= parts[:, rest].any(axis=1, keepdims=True)
-    return own
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,9 +71,7 @@ class StretchLimit:
         weighted = (gradient.T @ diags_array(np.repeat(area, 2))).tocsr()
         inertia = np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(held)) / _FOLLOW**2
         inertia = np.where(held, _HELD * inertia.max(), inertia)
-        system = csc_array(weighted @ gradient + diags_array(inertia))
-        options = {"SymmetricMode": True}
-        solver = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        solver = factored(weighted @ gradient + diags_array(inertia))
         least = np.full(len(faces), 1 - limit)
         return cls(faces, inverse, limit, least, gradient, weighted, inertia, solver)
 
@@ -114,6 +112,12 @@ class StretchLimit:
         offered[0::2] = x * a[:, None] + y * b[:, None]
         offered[1::2] = x * b[:, None] + y * d[:, None]
         return offered, bool((first != 1).any() or (second != 1).any())
+
+
+def factored(matrix: csr_array) -> SuperLU:
+    """A symmetric positive definite matrix, factored."""
+    options = {"SymmetricMode": True}
+    return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def deformation_gradient(
