@@ -160,7 +160,7 @@ def test_slip_is_what_lies_along_the_triangle():
     assert torch.allclose(weigh_slip(error, normal, 1.0), error)
 
 
-def test_resuming_pattern_training_is_exact(tmp_path):
+def test_resumed_pattern_training_ends_as_if_it_had_gone_on(tmp_path):
     dataset, options = tube_dataset(), PATTERNS
     train_patterns(
         dataset, tmp_path / "whole", run=RunOptions(steps=6, hold=1.0, measurements=1), options=options
