@@ -22,7 +22,7 @@ from isp_assets.geometry.projection import Projection, ProjectionOptions, projec
 from isp_assets.geometry.relaxation import relax
 
 _STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
-_RELAXINGS = (6, 3)  # rounds; the second evens out what clearing lifted after the first
+_PASSES, _ROUNDS = 4, 2  # at most; every pass evens out what clearing lifted after the one before
 _GENTLE = ProjectionOptions(rounds=3, ease=0, gentle=True)
 
 Obstacles = Sequence[Sequence[Obstacle]]
@@ -50,7 +50,8 @@ def relax_layer(
 ) -> list[Projection | None]:
     """Relax a layer in the frames that strain it, and clear it once more.
 
-    A share of the way is gone that grows with the strain, so that cloth does not jump as a pose gets hard.
+    Each pass goes a share of the way that grows with the strain that is left, so that cloth does not
+    jump as a pose gets hard.
 
     Args:
         worn: The layer.
@@ -70,24 +71,26 @@ def relax_layer(
 def _relaxed(
     worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle]
 ) -> Projection | None:
-    strain = worn.elastic.strain_p99(done.vertices)
-    share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
-    if share == 0:
-        return None
     mesh, own = replace(worn.collision, parts=cloth.parts), apart_from_arms(cloth.parts)
-    best, position = None, done.vertices
-    for rounds in _RELAXINGS:
-        goal = relax(position, worn.elastic, mesh, beneath, still=worn.tucked, rounds=rounds)
+    no_room = (done.tight | done.pressed)[:, None]
+    best, strain, position = done, worn.elastic.strain_p99(done.vertices), done.vertices
+    for _ in range(_PASSES):
+        share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
+        if share == 0:
+            break
+        goal = relax(position, worn.elastic, mesh, beneath, still=worn.tucked, rounds=_ROUNDS)
         clear = project(goal, worn.collision, beneath, _GENTLE, parts=own)
-        position, reached = clear.vertices, worn.elastic.strain_p99(clear.vertices)
+        # Without room, clearing would choose another side of the crease in every frame.
+        position = np.where(no_room, goal, clear.vertices)
         # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
-        if reached < strain:
-            best, strain = clear, reached
-    if best is None:
-        return None
-    # Both states keep their margins, and are near to one another: what lies between hardly uses them up.
-    between = done.vertices + share * (best.vertices - done.vertices)
-    return replace(best, vertices=between, tight=done.tight | best.tight, pressed=done.pressed | best.pressed)
+        if worn.elastic.strain_p99(position) >= strain:
+            continue
+        # Both states keep their margins, and are near to one another: what lies between hardly uses them up.
+        between = best.vertices + share * (position - best.vertices)
+        tight, pressed = best.tight | clear.tight, best.pressed | clear.pressed
+        best = replace(clear, vertices=between, tight=tight, pressed=pressed)
+        strain = worn.elastic.strain_p99(between)
+    return None if best is done else best
 
 
 @dataclass
