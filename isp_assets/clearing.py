@@ -72,7 +72,9 @@ def _relaxed(
     worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle]
 ) -> Projection | None:
     mesh, own = replace(worn.collision, parts=cloth.parts), apart_from_arms(cloth.parts)
-    no_room = (done.tight | done.pressed)[:, None]
+    # Cloth without room stays where relaxing led it, as clearing would choose another side of a crease in
+    # every frame; over a layer it is cleared all the same, to keep the order.
+    stay = (done.tight | done.pressed)[:, None] & (len(beneath) == 1)
     best, strain, position = done, worn.elastic.strain_p99(done.vertices), done.vertices
     for _ in range(_PASSES):
         share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
@@ -80,8 +82,7 @@ def _relaxed(
             break
         goal = relax(position, worn.elastic, mesh, beneath, still=worn.tucked, rounds=_ROUNDS)
         clear = project(goal, worn.collision, beneath, _GENTLE, parts=own)
-        # Without room, clearing would choose another side of the crease in every frame.
-        position = np.where(no_room, goal, clear.vertices)
+        position = np.where(stay, goal, clear.vertices)
         # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
         if worn.elastic.strain_p99(position) >= strain:
             continue
