@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from isp_assets.dressing import WornGarment
 from isp_assets.errors import DrapeError
 from isp_assets.geometry.buried import LaidCloth
-from isp_assets.geometry.obstacle import Obstacle, apart_from_arms
+from isp_assets.geometry.obstacle import Obstacle, apart_from_arms, joined_at_hips
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
 from isp_assets.geometry.relaxation import relax
 
@@ -40,9 +40,21 @@ def clear_layer(
     if not all(np.isfinite(cloth.vertices).all() for cloth in laid):
         raise DrapeError(f"layer {worn.layer.name}: positions are not finite before projection")
     return [
-        project(cloth.vertices, worn.collision, beneath, options, stretch=worn.stretch, parts=cloth.parts)
+        project(
+            cloth.vertices, worn.collision, beneath, options,
+            stretch=worn.stretch, parts=_parts_beneath(worn, cloth, beneath),
+        )
         for cloth, beneath in zip(laid, obstacles, strict=True)
-    ]
+    ]  # fmt: skip
+
+
+def _parts_beneath(
+    worn: WornGarment, cloth: LaidCloth, beneath: Sequence[Obstacle]
+) -> Bool[np.ndarray, "V 6"]:
+    """Parts that a layer must stay above: over other layers, and tucked in, only those that it belongs to."""
+    if len(beneath) > 1:
+        return cloth.parts
+    return np.where(worn.tucked[:, None], cloth.parts, joined_at_hips(cloth.parts))
 
 
 def relax_layer(
@@ -130,6 +142,7 @@ class Calm:
                 moved = self.share * self.moved + (1 - self.share) * moved
             self.moved = moved
             calmed = before + moved @ turn.T
-            clear = project(calmed, worn.collision, obstacles[t], short, parts=laid[t].parts).vertices
+            parts = _parts_beneath(worn, laid[t], obstacles[t])
+            clear = project(calmed, worn.collision, obstacles[t], short, parts=parts).vertices
             result[t] = np.where((done.tight | done.pressed)[:, None], calmed, clear)
         return result

@@ -1,4 +1,7 @@
-"""Calming over time: exact in any pieces, nothing in the first frame, a fixed point where nothing moves."""
+"""Calming over time: exact in any pieces, nothing in the first frame, a fixed point where nothing moves.
+
+Cloth in the crease of a hip: clear of thighs and belly, and steady.
+"""
 
 from dataclasses import replace
 
@@ -9,12 +12,16 @@ import torch
 from isp_assets.body import Body
 from isp_assets.clearing import Calm, clear_layer
 from isp_assets.collection import Collection
+from isp_assets.conventions import FrameRange
+from isp_assets.drape import DrapeOptions, drape
 from isp_assets.dressing import WornGarment, dress
 from isp_assets.errors import DrapeError
+from isp_assets.evaluate.frames import FrameMeter
 from isp_assets.geometry.buried import LaidCloth
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle
-from isp_assets.geometry.projection import Projection, ProjectionOptions
+from isp_assets.geometry.projection import Projection, ProjectionOptions, project
 from isp_assets.motion import Motion
+from isp_assets.shot import Shot
 from isp_assets.skinning import skin_garment
 
 OPTIONS = ProjectionOptions()
@@ -96,3 +103,35 @@ def test_positions_that_are_not_finite_are_refused(scene: Scene) -> None:
     broken[1] = replace(broken[1], vertices=vertices)
     with pytest.raises(DrapeError, match="L00_tee: positions are not finite"):
         clear_layer(scene.worn, broken, scene.obstacles, OPTIONS)
+
+
+@pytest.mark.parametrize("name", ["a_line_skirt", "long_sleeved_shirt"])
+def test_cloth_lies_on_thighs_and_belly_alike_in_a_squat(name: str) -> None:
+    motion = Motion.load("squat").select(FrameRange(38, 39))
+    shot = Shot("squat", Body.load("default"), motion)
+    frames = drape(Collection.load().outfit([name]), shot, DrapeOptions(resolution=64))
+    (chunk,) = list(frames)
+    moved = np.linalg.norm(np.diff(chunk.layers[0], axis=0), axis=2).max()
+    skin_moved = np.linalg.norm(np.diff(chunk.body, axis=0), axis=2).max()
+    assert moved < 2 * skin_moved
+    meter = FrameMeter(frames.scene)
+    layer = frames.scene.layers[0].name
+    for index in range(2):
+        assert meter.measure(chunk, index)[f"final/{layer}/body_area_percent"] < 0.1
+
+
+def test_a_tucked_hem_and_outer_layers_keep_to_their_own_parts(scene: Scene) -> None:
+    """Drawn in from the thighs, not lifted over them."""
+    cloth, beneath = scene.before[0], scene.obstacles[0]
+    tucked = replace(scene.worn, tucked=np.ones(scene.worn.layer.garment.num_vertices, bool))
+
+    def cleared(worn: WornGarment, over: list[Obstacle]) -> np.ndarray:
+        return clear_layer(worn, [cloth], [over], OPTIONS)[0].vertices
+
+    def projected(over: list[Obstacle]) -> np.ndarray:
+        own = project(cloth.vertices, scene.worn.collision, over, OPTIONS, stretch=scene.worn.stretch)
+        return own.vertices
+
+    np.testing.assert_array_equal(cleared(tucked, beneath), projected(beneath))
+    two = [*beneath, beneath[0]]
+    np.testing.assert_array_equal(cleared(scene.worn, two), projected(two))

@@ -5,7 +5,14 @@ import pytest
 from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, sheet, tube, weights
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.obstacle import BODY_PARTS, NO_ROOM, CollisionMesh, Obstacle, mean_edge
+from isp_assets.geometry.obstacle import (
+    BODY_PARTS,
+    NO_ROOM,
+    CollisionMesh,
+    Obstacle,
+    joined_at_hips,
+    mean_edge,
+)
 
 PARTS = list(BODY_PARTS)
 
@@ -35,6 +42,19 @@ def test_a_vertex_of_many_parts_belongs_to_its_strongest() -> None:
     even = np.zeros((3, 24))
     even[:, [0, 16, 17, 1, 2, 15]] = [0.15, 0.2, 0.15, 0.2, 0.15, 0.15]
     assert CollisionMesh.build(faces, even).parts.sum(1).tolist() == [1, 1, 1]
+
+
+def test_torso_and_legs_are_joined_at_the_hips_but_not_leg_to_leg() -> None:
+    each = np.eye(len(PARTS), dtype=bool)
+    joined = {
+        part: {other for other, own in zip(PARTS, row, strict=True) if own}
+        for part, row in zip(PARTS, joined_at_hips(each), strict=True)
+    }
+    assert joined.pop("torso") == {"torso", "left_leg", "right_leg"}
+    assert joined.pop("left_leg") == {"left_leg", "torso"}
+    assert joined.pop("right_leg") == {"right_leg", "torso"}
+    assert all(others == {part} for part, others in joined.items())
+    np.testing.assert_array_equal(each, np.eye(len(PARTS)))
 
 
 def test_contact_is_sought_on_shared_parts_only() -> None:

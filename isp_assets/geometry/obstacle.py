@@ -33,8 +33,10 @@ BODY_PARTS: dict[str, tuple[int, ...]] = {
     "right_leg": (2, 5, 8, 11),
 }
 """Joints of each part."""
+TORSO = list(BODY_PARTS).index("torso")
 ARMS = tuple(list(BODY_PARTS).index(name) for name in ("left_arm", "right_arm"))
-"""Places of the arms among the parts."""
+LEGS = tuple(list(BODY_PARTS).index(name) for name in ("left_leg", "right_leg"))
+"""Places among the parts."""
 
 NO_ROOM = 0.005
 """Surfaces this near to one another [m] leave no room for cloth between them."""
@@ -56,6 +58,17 @@ def apart_from_arms(parts: Bool[np.ndarray, "V 6"]) -> Bool[np.ndarray, "V 6"]:
     own = parts.copy()
     rest = np.setdiff1d(np.arange(parts.shape[1]), ARMS)
     own[:, rest] |= parts[:, rest].any(axis=1, keepdims=True)
+    return own
+
+
+def joined_at_hips(parts: Bool[np.ndarray, "V 6"]) -> Bool[np.ndarray, "V 6"]:
+    """Parts that cloth on bare skin lies on: the torso's on the legs as well, a leg's on the torso.
+
+    Folded up, thighs press on the belly; their cloth must be lifted over either, not drawn in from one.
+    """
+    own = parts.copy()
+    own[:, LEGS] |= parts[:, [TORSO]]
+    own[:, TORSO] |= parts[:, LEGS].any(axis=1)
     return own
 
 
