@@ -51,7 +51,7 @@ def folded_bodies(setup: StressSetup) -> Iterator[StressCase]:
         )
     depths = setup.sweep(10, 65, 5)
     motion = motions.deep_squat(setup.figure, depths)
-    for outfit in (["long_sleeved_shirt", "trousers"], ["mini_skirt"]):
+    for outfit in (["long_sleeved_shirt", "trousers"], ["trousers", "tee"], ["mini_skirt"]):
         yield setup.case("T3", f"squat, {outfit[-1]}", outfit, motion, Sweep("depth [cm]", depths))
 
 
