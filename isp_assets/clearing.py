@@ -98,7 +98,7 @@ def _relaxed(
         # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
         if worn.elastic.strain_p99(position) >= strain:
             continue
-        # Both states keep their margins, and are near to one another: what lies between hardly uses them up.
+        # With room, both states keep their margins and are near one another: between them little is used up.
         between = best.vertices + share * (position - best.vertices)
         tight, pressed = best.tight | clear.tight, best.pressed | clear.pressed
         best = replace(clear, vertices=between, tight=tight, pressed=pressed)
