@@ -236,7 +236,7 @@ class Draper:
         else:
             state.keep("project", vertices, keep)
         outside = torch.as_tensor(result, device=vertices.device)
-        state.beneath.append(Surface.of_mesh(outside, worn.faces, reach=0.05))
+        state.beneath.append(Surface.of_cloth(outside, worn.faces, state.skinned[index], reach=0.05))
         margin = self.options.layer_margin
         state.finished.append(
             [

@@ -38,6 +38,34 @@ def tube(
     return vertices.reshape(-1, 3), grid(len(heights), columns, wrap=True)
 
 
+FOLDED_PROFILE = np.array(
+    [[0.1, y] for y in np.linspace(-0.2, 0, 11)]
+    + [[0.13, 0.03], [0.105, 0.06], [0.125, 0.05]]
+    + [[0.1, y] for y in np.linspace(0.06, 0.2, 8)]
+)
+"""Radius and height of `folded_tube`, from its low border to its high one."""
+
+
+def folded_tube(columns: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """A tube of radius 0.1 with a fold around it that cuts itself: vertices and faces."""
+    angle = 2 * np.pi * np.arange(columns) / columns
+    radius, height = (np.repeat(part[:, None], columns, axis=1) for part in FOLDED_PROFILE.T)
+    vertices = np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], -1)
+    return vertices.reshape(-1, 3), grid(len(FOLDED_PROFILE), columns, wrap=True)
+
+
+def beside_fold(count: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """Points around the fold of `folded_tube`, and which of them lie within its profile and the axis."""
+    rng = np.random.default_rng(0)
+    radius, height = rng.uniform(0.08, 0.14, count), rng.uniform(0, 0.08, count)
+    loop = np.concatenate([FOLDED_PROFILE, [[0, 0.2], [0, -0.2]], FOLDED_PROFILE[:1]])
+    seen = loop[None] - np.stack([radius, height], 1)[:, None]
+    turns = np.diff(np.arctan2(seen[..., 1], seen[..., 0]), axis=1)
+    turns = ((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)
+    points = np.stack([0 * radius, height, radius], axis=1)
+    return points, turns > 0.5
+
+
 def ball(
     radius: float = 0.1, *, centre: tuple[float, float, float] = (0, 0, 0)
 ) -> tuple[np.ndarray, np.ndarray]:

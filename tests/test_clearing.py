@@ -120,6 +120,19 @@ def test_cloth_lies_on_thighs_and_belly_alike_in_a_squat(name: str) -> None:
         assert meter.measure(chunk, index)[f"final/{layer}/body_area_percent"] < 0.1
 
 
+def test_a_tee_stays_outside_trousers_whose_waist_folds_over_itself_in_a_squat() -> None:
+    motion = Motion.load("squat").select(FrameRange(31, 31))
+    shot = Shot("squat", Body.load("default"), motion)
+    options = DrapeOptions(resolution=64, keep_stages=True)
+    frames = drape(Collection.load().outfit(["trousers", "tee"]), shot, options)
+    (chunk,) = list(frames)
+    found = FrameMeter(frames.scene).measure(chunk, 0, stages=True)
+    tee = frames.scene.layers[1].name
+    assert found[f"layering/{tee}/body_area_percent"] < 0.1
+    assert found[f"final/{tee}/inner_area_percent"] < 0.05
+    assert found[f"final/{tee}/strain_p99"] < 0.3
+
+
 def test_a_tucked_hem_and_outer_layers_keep_to_their_own_parts(scene: Scene) -> None:
     """Drawn in from the thighs, not lifted over them."""
     cloth, beneath = scene.before[0], scene.obstacles[0]

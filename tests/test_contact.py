@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from collision_shapes import folded_tube
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -120,6 +121,22 @@ def test_mesh_samples_lie_on_the_mesh_and_point_outwards() -> None:
     surface = Surface.of_mesh(vertices, faces, centroids=True)
     assert surface.points.shape[0] == len(ball.vertices) + len(ball.faces)
     assert ((surface.points * surface.normals).sum(-1) > 0.98).all()
+
+
+def test_samples_of_cloth_point_outwards_where_a_fold_turned_it_over() -> None:
+    vertices, faces = (torch.from_numpy(part) for part in folded_tube())
+    smooth = vertices * torch.tensor([1.0, 0, 1.0])
+    smooth = 0.1 * smooth / smooth.norm(dim=1, keepdim=True) + vertices * torch.tensor([0, 1.0, 0])
+    smooth[:, 1] = torch.linspace(-0.2, 0.2, len(smooth) // 60).repeat_interleave(60)
+    away = torch.nn.functional.normalize(vertices * torch.tensor([1.0, 0, 1.0]), dim=1)
+    plain = Surface.of_mesh(vertices, faces)
+    surface = Surface.of_cloth(vertices, faces, smooth, reach=0.05)
+    turned = (plain.normals * away).sum(1) < -0.01
+    assert turned.any()
+    assert ((surface.normals * away).sum(1) > -0.01).all()
+    assert torch.equal(surface.normals[~turned], plain.normals[~turned])
+    assert torch.equal(surface.points, vertices)
+    assert surface.reach == 0.05
 
 
 def test_bad_input_is_refused() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from collision_shapes import beside_fold, folded_tube
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import SurfaceTopology
@@ -80,6 +81,17 @@ def test_depth_beyond_reach_and_beyond_the_border_do_not_count() -> None:
         assert measure_intersection(outer.vertices, outer.faces, inner).area_percent == 0
     deep = _sheet(5, size=0.2, height=-0.95 * INNER_REACH)
     assert measure_intersection(deep.vertices, deep.faces, inner).area_percent == pytest.approx(100)
+
+
+def test_what_lies_outside_a_fold_that_cuts_itself_is_not_beneath() -> None:
+    layer, (points, within) = trimesh.Trimesh(*folded_tube(), process=False), beside_fold()
+    beneath = _beneath(layer, closed=False)
+    wrong = beneath.depth(points)[0] > 0
+    assert (beneath.closest(points[~within]).height < 0).sum() > 300
+    assert not wrong[~within].any()
+    near = within & (points[:, 1] > 0.065) & (points[:, 2] > 0.085)
+    assert near.sum() > 50
+    assert wrong[near].all()
 
 
 def test_cloth_on_the_outer_side_of_buried_skin_is_excused_up_to_three_centimetres() -> None:

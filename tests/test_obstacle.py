@@ -2,7 +2,18 @@
 
 import numpy as np
 import pytest
-from collision_shapes import LEFT_ARM, TORSO, ball, collision, obstacle, sheet, tube, weights
+from collision_shapes import (
+    LEFT_ARM,
+    TORSO,
+    ball,
+    beside_fold,
+    collision,
+    folded_tube,
+    obstacle,
+    sheet,
+    tube,
+    weights,
+)
 
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.obstacle import (
@@ -80,6 +91,16 @@ def test_parts_together_find_what_the_whole_surface_finds() -> None:
     points = 0.1 * np.random.default_rng(0).normal(size=(200, 3))
     split = below.contacts(points, np.ones((200, 6), bool), within=1.0)
     np.testing.assert_allclose(split.height, below.whole(points).height, atol=1e-12)
+
+
+def test_points_outside_a_fold_that_cuts_itself_are_not_beneath_it() -> None:
+    layer, (points, within) = obstacle(folded_tube()), beside_fold()
+    misled = ~within & (layer.whole(points).height < 0)
+    assert misled.sum() > 300  # by the nearest triangle
+    found = layer.contacts(points, np.tile(layer.mesh.parts[:1], (len(points), 1)), within=0.1)
+    assert np.isposinf(found.height[misled]).all()
+    assert not (~within & (found.height < 0)).any()
+    np.testing.assert_array_equal(found.height[~misled], layer.whole(points[~misled]).height)
 
 
 def test_room_is_missing_only_where_surfaces_press_together() -> None:

@@ -10,13 +10,13 @@ Positions are in metres, in one shared space. NumPy, one frame at a time.
 from dataclasses import dataclass
 from functools import cached_property
 
-import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from isp_assets.geometry.closest import ClosestQuery
 from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import fade_out
+from isp_assets.geometry.winding import Winding
 
 _ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is; less depth hides nothing
 _FROM, _FULL = 0.02, 0.035  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
@@ -42,10 +42,8 @@ class BodyObstacle(Obstacle):
             # Beyond the cut, where the part was joined to the others, there is no side.
             depth[index, part] = np.where(found.on_cut, 0, (-found.height).clip(0))
         if depth.any():
-            tree = igl.FastWindingNumberBVH()
-            tree.init(self.vertices, faces)
             probe = self.vertices + _ABOVE * self.normals.of_vertices
-            depth[tree.winding_number(probe).reshape(-1) < 0.5] = 0
+            depth[~Winding(self.vertices, faces).inside(probe)] = 0
         return depth
 
     @cached_property

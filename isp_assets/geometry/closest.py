@@ -37,6 +37,11 @@ class SurfaceTopology:
     border_vertex: Bool[np.ndarray, " V"]
 
     @cached_property
+    def is_open(self) -> bool:
+        """Whether the surface has a border, as every garment has."""
+        return bool(self.border_vertex.any())
+
+    @cached_property
     def neighbour_average(self) -> csr_array:
         """Matrix [V, V] that averages a field over the neighbours of each vertex."""
         faces, count = self.faces, len(self.border_vertex)

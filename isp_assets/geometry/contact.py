@@ -69,6 +69,27 @@ class Surface:
             normals = torch.cat([normals, face_normals(vertices, faces)], -2)
         return cls(points.detach(), normals.detach(), reach)
 
+    @classmethod
+    def of_cloth(
+        cls,
+        vertices: Float[Tensor, "*batch V 3"],
+        faces: Int[Tensor, "F 3"],
+        unfolded: Float[Tensor, "*batch V 3"],
+        *,
+        reach: float = math.inf,
+    ) -> "Surface":
+        """Sample a garment at its vertices; what a fold turned over gets its normal without the fold.
+
+        Args:
+            vertices: The garment [m].
+            faces: Its triangles.
+            unfolded: The garment in the same pose without folds, as skinning gives it [m].
+            reach: Samples further than this from a vertex [m] do not touch it.
+        """
+        normals, upright = vertex_normals(vertices, faces), vertex_normals(unfolded, faces)
+        overturned = (normals * upright).sum(-1, keepdim=True) < 0
+        return cls(vertices.detach(), torch.where(overturned, upright, normals).detach(), reach)
+
     @cached_property
     def trees(self) -> list[cKDTree]:
         """One search tree per batch entry; built on first use."""

@@ -11,7 +11,6 @@ Positions are in metres, in one shared space. NumPy, one frame at a time.
 from dataclasses import dataclass
 from functools import cached_property
 
-import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
@@ -19,6 +18,7 @@ from scipy.spatial import cKDTree
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import ClosestQuery, SurfaceTopology
 from isp_assets.geometry.crossing import crossing_pairs
+from isp_assets.geometry.winding import Winding
 
 INNER_REACH = 0.02
 """How far beneath an inner garment [m] a point still counts as inside it."""
@@ -61,7 +61,8 @@ class Beneath:
             vertices: Its positions [m].
             topology: Its connectivity.
             closed: True for a body: inside is where the winding number exceeds one half.
-                False for a garment: inside is beneath its nearest triangle, at most ``INNER_REACH``.
+                False for a garment: inside is beneath its nearest triangle, at most ``INNER_REACH``, where
+                the winding number says so as well: a fold may have turned the triangle over.
             body: What wears the garment; without it, no place counts as unavoidable.
         """
         if closed and topology.border_vertex.any():
@@ -78,17 +79,15 @@ class Beneath:
         return ClosestQuery(self.vertices, self.topology)
 
     @cached_property
-    def _winding(self) -> igl.FastWindingNumberBVH:
-        tree = igl.FastWindingNumberBVH()
-        tree.init(self.vertices, self.topology.faces)
-        return tree
+    def winding(self) -> Winding:
+        return Winding(self.vertices, self.topology.faces)
 
     @cached_property
     def without_room(self) -> Bool[np.ndarray, " V"]:
         """Vertices of a body above which cloth finds no room: creases, and parts that press together."""
         if not self.closed:
             return np.zeros(len(self.vertices), bool)
-        return self._inside(self.vertices + _room(0) * self.closest.normals.of_vertices)
+        return self.winding.inside(self.vertices + _room(0) * self.closest.normals.of_vertices)
 
     def leaves_no_room(self, points: Float[np.ndarray, "P 3"], layers: int) -> Bool[np.ndarray, " P"]:
         """Whether a body's skin near points has no room for cloth over so many layers.
@@ -103,14 +102,11 @@ class Beneath:
         skin = np.einsum("qk,fkc->fqc", weights, self.vertices[around]).reshape(-1, 3)
         away = np.einsum("qk,fkc->fqc", weights, normals[around]).reshape(-1, 3)
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        skin = skin[self._inside(skin + room * away)]
+        skin = skin[self.winding.inside(skin + room * away)]
         if len(skin) == 0:
             return np.zeros(len(points), bool)
         found, _ = cKDTree(skin, balanced_tree=False).query(points, distance_upper_bound=_NEAR)
         return np.asarray(found < _NEAR)
-
-    def _inside(self, points: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-        return np.asarray(self._winding.winding_number(points).reshape(-1) > 0.5)
 
     def depth(
         self, points: Float[np.ndarray, "P 3"], layers: int = 0
@@ -128,10 +124,11 @@ class Beneath:
             inside = found.height < 0
             above = self.without_room[self.topology.faces[found.face]].any(1)
             if above.any():
-                inside[above] = self._inside(points[above])
+                inside[above] = self.winding.inside(points[above])
             excused = above & (found.height > 0) & (distance < _OVER)
         else:
             inside = (found.height < 0) & ~found.on_border & (distance < INNER_REACH)
+            inside[inside] = self.winding.beneath(points[inside])
             excused = np.zeros(len(points), bool)
         rest = np.flatnonzero(inside & ~excused)
         if len(rest) and self.body is not None:

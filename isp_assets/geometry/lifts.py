@@ -4,7 +4,6 @@ Parts of the projection. Positions are in metres. NumPy, one frame at a time.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,8 +21,6 @@ WATCHED = 0.008
 CLEAR = 0.0003
 """How far [m] a triangle that was found on the wrong side is lifted over the other surface."""
 _CRAMPED = 0.01  # a vertex this near [m] to a place without room for cloth has no room itself
-_DEEP = 0.015  # contact with a layer deeper than this [m] is doubted
-_DEEPER = 0.02  # and not believed if it is deeper by this [m] than the layer stands off the skin
 _FINISH_STEP = 0.002  # largest lift [m] of a crossing triangle in one round
 _POKE_STEP = 0.006  # largest lift [m] of a triangle's corner over a vertex in one round
 _SAME_SIDE = 0.25  # cosine from which two pieces of surface count as facing the same way
@@ -61,33 +58,6 @@ class Neighbour:
         self.cramped = beneath & (np.abs(found.height) < _CRAMPED)
         self.narrow = narrowness(obstacle, found)
         """How little room each vertex has over it, 0 to 1."""
-
-
-def credible_contacts(
-    points: Float[np.ndarray, "P 3"], parts: Bool[np.ndarray, "P 6"], obstacle: Obstacle, *, body: Obstacle
-) -> Closest:
-    """Closest points on an obstacle; infinite heights where nothing can lie beneath it.
-
-    Cloth cannot lie deeper beneath a layer than the layer stands off the skin. What seems to lies beside a
-    fold of it that faces away, such as a hem bunched in the crease of a hip.
-
-    Args:
-        points: Vertices of the garment [m].
-        parts: Parts of the body that they must stay above.
-        obstacle: The body, or a layer beneath.
-        body: The body.
-    """
-    found = obstacle.contacts(points, parts, within=ASIDE)
-    deep = np.flatnonzero((found.height < -_DEEP) & ~found.on_border)
-    if obstacle is body or len(deep) == 0:
-        return found
-    stands_off = body.contacts(found.point[deep], obstacle.parts_at(found.face[deep]), within=ASIDE).height
-    above = body.contacts(points[deep], parts[deep], within=ASIDE).height
-    # Beneath the layer, height over the skin and depth would make up what it stands off. All may be infinite.
-    beside = deep[above - found.height[deep] > stands_off + _DEEPER]
-    height = found.height.copy()
-    height[beside] = np.inf
-    return replace(found, height=height)
 
 
 def open_beneath(

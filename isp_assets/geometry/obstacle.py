@@ -23,6 +23,7 @@ from isp_assets.geometry.closest import (
     SurfacePart,
     SurfaceTopology,
 )
+from isp_assets.geometry.winding import Winding
 
 BODY_PARTS: dict[str, tuple[int, ...]] = {
     "torso": (0, 3, 6, 9, 13, 14),
@@ -169,6 +170,11 @@ class Obstacle:
         return ClosestQuery(self.vertices, self.mesh.topology, normals=self.normals)
 
     @cached_property
+    def winding(self) -> Winding:
+        """Tells the side of points where folds mislead."""
+        return Winding(self.vertices, self.mesh.topology.faces)
+
+    @cached_property
     def room(self) -> Float[np.ndarray, " V"]:
         """How far above each vertex another place of the surface lies [m]; 1 cm or four margins at most."""
         half = max(2 * self.margin, NO_ROOM)
@@ -227,7 +233,8 @@ class Obstacle:
         """Closest points on faces that share a part with each point.
 
         Points outside a part's box by more than ``within`` [m] are not sought there; points
-        without any candidate get height +inf, and the point itself as the closest one.
+        without any candidate get height +inf, and the point itself as the closest one. So do
+        points outside of cloth whose closest triangle a fold turned over: +inf.
         """
         best = Closest(
             points.copy(), np.zeros(len(points), np.int64), np.zeros_like(points), np.zeros_like(points),
@@ -243,6 +250,9 @@ class Obstacle:
             closer = np.abs(found.height) < np.abs(best.height[index])
             for field in ("point", "face", "weights", "normal", "height", "on_border", "on_cut"):
                 getattr(best, field)[index[closer]] = getattr(found, field)[closer]
+        if self.mesh.topology.is_open:
+            beneath = np.flatnonzero((best.height < 0) & ~best.on_border)
+            best.height[beneath[~self.winding.beneath(points[beneath])]] = np.inf
         return best
 
     def _query(self, part: int) -> ClosestQuery:

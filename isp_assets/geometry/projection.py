@@ -23,10 +23,10 @@ from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery
 from isp_assets.geometry.crossing import crossing_pairs
 from isp_assets.geometry.lifts import (
+    ASIDE,
     CLEAR,
     Neighbour,
     any_corner,
-    credible_contacts,
     open_beneath,
     over_planes,
     over_vertices,
@@ -151,7 +151,7 @@ class _Projector:
         """What lies beneath, the outermost layer first and the body last."""
         open_parts, edge = mesh.parts, mean_edge(position, mesh.topology.faces)
         for obstacle in reversed(obstacles):
-            found = credible_contacts(position, open_parts, obstacle, body=obstacles[0])
+            found = obstacle.contacts(position, open_parts, within=ASIDE)
             self.near.append(Neighbour(obstacle, open_parts, found, edge=edge))
             open_parts = open_beneath(open_parts, obstacle, found)
         deepest = np.max([n.depth for n in self.near], axis=0).clip(max=options.reach)
@@ -259,7 +259,7 @@ class _Projector:
             return np.arange(len(self.position)), neighbour.found
         index = np.flatnonzero(neighbour.watched)
         points, own = self.position[index], neighbour.own[index]
-        return index, credible_contacts(points, own, neighbour.obstacle, body=self.near[-1].obstacle)
+        return index, neighbour.obstacle.contacts(points, own, within=ASIDE)
 
     def _lift_triangles(
         self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, gap: float | None = None

@@ -152,15 +152,16 @@ class LayeringTask:
         depth = 2 + int(torch.multinomial(shares, 1, generator=generator))
         chosen = [wearers[int(i)] for i in torch.randint(len(wearers), (depth,), generator=generator)]
         skin = [Obstacle(self.body_collision, v, margin=0.0) for v in posed.vertices.cpu().numpy()]
-        layers = _tucked(chosen, [wearer.drape(posed, betas.to(self.device)) for wearer in chosen], skin)
+        draped = [wearer.drape(posed, betas.to(self.device)) for wearer in chosen]
+        layers = _tucked(chosen, [vertices for _, vertices in draped], skin)
         inner: list[tuple[Any, Tensor]] = []
-        for wearer, vertices in zip(chosen[:-1], layers[:-1], strict=True):
+        for wearer, (skinned, _), vertices in zip(chosen[:-1], draped[:-1], layers[:-1], strict=True):
             if inner:
                 vertices, _ = correct_layer(wearer.layering, vertices, beneath, posed, ramp=wearer.ramp)
             # A plain push stands in for the projection that follows in use.
             vertices = vertices + force(vertices, beneath, margin=self.options.contact.margin / 2)
             inner.append((wearer, vertices))
-            beneath.append(Surface.of_mesh(vertices, wearer.rest.faces, reach=LAYER_REACH))
+            beneath.append(Surface.of_cloth(vertices, wearer.rest.faces, skinned, reach=LAYER_REACH))
         return Stack(chosen[-1], posed, betas.to(self.device), layers[-1], tuple(beneath), tuple(inner))
 
     def _scaled(self, stack: Stack, vertices: Tensor, stiffness: float) -> dict[str, Tensor]:

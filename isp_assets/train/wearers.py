@@ -42,13 +42,15 @@ class Wearer:
     layering: BoundLayering
     collision: CollisionMesh
 
-    def drape(self, posed: PosedBody, betas: Float[Tensor, " B"]) -> Float[Tensor, "T V 3"]:
-        """Positions after skinning and D_s [m]."""
+    def drape(
+        self, posed: PosedBody, betas: Float[Tensor, " B"]
+    ) -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T V 3"]]:
+        """Positions after skinning, and after D_s [m]."""
         skinned, linear = skin_garment(self.bound, posed, betas)
         if self.field is None or self.displacement is None:
-            return skinned
+            return skinned, skinned
         features = drape_features(posed, betas, self.code, num_betas=self.field.config.num_betas)
-        return displace(skinned, linear, displacements(self.displacement, self.field, features))
+        return skinned, displace(skinned, linear, displacements(self.displacement, self.field, features))
 
 
 @torch.no_grad()
