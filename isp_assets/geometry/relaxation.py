@@ -1,10 +1,11 @@
-"""Relax a garment that is strained: a state of lower energy near by, clear of the skin.
+"""Relax a garment that is strained: a state of lower energy near by, clear of what lies beneath.
 
 Projection looks at one vertex at a time and eases what it strained close by. Where a pose strains
 a whole garment, as a deep squat does its seat, the cloth has to move as a whole. That is a
-minimum of its energy (membrane, bending, gravity) over planes through the nearest skin, which
-are looked up anew after every few steps. Each step is one of L-BFGS, whose first guess of the
-inverse Hessian is the constant matrix of projective dynamics, factored once a garment.
+minimum of its energy (membrane, bending, gravity) over planes through the nearest skin, and the
+nearest cloth of every layer beneath, which are looked up anew after every few steps. Each step is
+one of L-BFGS, whose first guess of the inverse Hessian is the constant matrix of projective
+dynamics, factored once a garment.
 
 Positions are in metres, Y up, in one shared space. NumPy, one frame at a time.
 
@@ -30,11 +31,10 @@ from isp_assets.geometry.stretch import deformation_gradient, factored
 
 _CONTACT = 2e6  # stiffness of contact per mass [1/s²]
 _ABOVE = 0.001  # asked for on top of the margin [m]: a penalty gives way a little
-_NEAR = 0.02  # cloth further than this above its margin [m] meets no skin in a few steps
+_NEAR = 0.02  # cloth further than this above its margin [m] meets nothing in a few steps
 _DEEP = 0.06  # cloth deeper than this [m] does not know its way out
 _DEPTH = 0.025  # lacking clearance beyond which the penalty grows linearly [m]
 _CAUGHT = 0.002  # cloth this near to the margin of another limb [m] stays where projection put it
-_LAYERED = 0.015  # so does cloth this near to a layer beneath [m]
 _HOLD = 5.0  # how firmly, relative to contact
 _HELD = 1e6  # weight of a held vertex, relative to a free one
 _DAMPING = 0.05  # share of its diagonal that the matrix gains, since the membrane resists no bending
@@ -137,7 +137,7 @@ def relax(
     rounds: int = 6,
     steps: int = 5,
 ) -> Float[np.ndarray, "V 3"]:
-    """Lower the energy of a garment where it lies on the skin; what lies on a layer stays.
+    """Lower the energy of a garment over the skin and the layers beneath.
 
     Args:
         vertices: The garment in this frame, clear of what lies beneath [m].
@@ -145,11 +145,11 @@ def relax(
         mesh: Its collision data, with the parts that its vertices belong to in this frame.
         beneath: The body, then every inner garment.
         still: Further vertices that stay, such as those of a hem that was pressed flat.
-        rounds: Times that the nearest skin is looked up.
+        rounds: Times that the nearest surfaces are looked up.
         steps: Steps after each.
 
     Returns:
-        New positions [m]. They may cut the skin by some tenths of a millimetre.
+        New positions [m]. They may cut what lies beneath by some tenths of a millimetre.
 
     Raises:
         GeometryError: If ``rounds`` or ``steps`` is below 1.
@@ -160,14 +160,18 @@ def relax(
     own, skin = apart_from_arms(mesh.parts), beneath[0]
     touch = skin.contacts(start, ~own, within=_NEAR)
     caught = (touch.height < skin.margin + _CAUGHT) & ~touch.on_border & ~touch.on_cut
-    for layer in beneath[1:]:
-        caught |= np.abs(layer.contacts(start, mesh.parts, within=_LAYERED).height) < _LAYERED
     stiffness = _CONTACT * cloth.mass
     if still is not None:
         caught |= still
     hold = (_HOLD * stiffness * caught)[:, None]
+    parts = [own] + [mesh.parts] * (len(beneath) - 1)
     for _ in range(rounds):
-        planes = _Planes.nearest(position, own, skin, stiffness, concerned=~caught)
+        planes = _Planes.joined(
+            [
+                _Planes.nearest(position, on, surface, stiffness, concerned=~caught)
+                for on, surface in zip(parts, beneath, strict=True)
+            ]
+        )
 
         def energy(place: Float[np.ndarray, "V 3"], planes: _Planes = planes) -> tuple[float, np.ndarray]:
             total, gradient = cloth.energy(place)
@@ -182,7 +186,7 @@ def relax(
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """Planes through the nearest skin of some vertices, which they stay above."""
+    """Planes through the nearest skin or layer of some vertices, which they stay above."""
 
     index: Int[np.ndarray, " n"]
     point: Float[np.ndarray, "n 3"]
@@ -195,20 +199,26 @@ class _Planes:
         cls,
         position: Float[np.ndarray, "V 3"],
         own: Bool[np.ndarray, "V 6"],
-        skin: Obstacle,
+        surface: Obstacle,
         stiffness: Float[np.ndarray, " V"],
         *,
         concerned: Bool[np.ndarray, " V"],
     ) -> "_Planes":
-        found = skin.contacts(position, own, within=_DEEP)
-        level = skin.margin_at(found) + _ABOVE
+        found = surface.contacts(position, own, within=_DEEP)
+        level = surface.margin_at(found) + _ABOVE
         near = concerned & (found.height < level + _NEAR) & (found.height > -_DEEP) & ~found.on_border
         index = np.flatnonzero(near)
-        # Above its level, a vertex is kept from the skin by the way to it; beneath, by the skin's own normal.
+        # Above its level, a vertex is kept off by the way to it; beneath, by the surface's own normal.
         way = (position - found.point)[index] / np.maximum(np.abs(found.height[index]), 1e-9)[:, None]
         above = (found.height > level)[index]
         normal = np.where(above[:, None], way, found.normal[index])
         return cls(index, found.point[index], normal, level[index], stiffness[index])
+
+    @classmethod
+    def joined(cls, planes: Sequence["_Planes"]) -> "_Planes":
+        """All planes of several surfaces."""
+        names = ("index", "point", "normal", "level", "stiffness")
+        return cls(*(np.concatenate([getattr(each, name) for each in planes]) for name in names))
 
     def energy(self, position: Float[np.ndarray, "V 3"]) -> tuple[float, Float[np.ndarray, "V 3"]]:
         """Penalty for what lacks to the levels: quadratic, then linear."""
@@ -216,7 +226,7 @@ class _Planes:
         lacking = (self.level - height).clip(0)
         near = lacking.clip(max=_DEPTH)
         gradient = np.zeros_like(position)
-        gradient[self.index] = -(self.stiffness * near)[:, None] * self.normal
+        np.add.at(gradient, self.index, -(self.stiffness * near)[:, None] * self.normal)
         return float((self.stiffness * (0.5 * near**2 + _DEPTH * (lacking - near))).sum()), gradient
 
 
