@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import Closest, ClosestQuery
 from isp_assets.geometry.crossing import crossing_pairs
+from isp_assets.geometry.driven_in import driven_in
 from isp_assets.geometry.lifts import (
     ASIDE,
     CLEAR,
@@ -127,6 +128,7 @@ def project(
     mesh = mesh if parts is None else replace(mesh, parts=parts)
     work = _Projector(start, mesh, obstacles, options, stretch)
     rounds = work.lift()
+    work.undo(start)
     work.keep_order()
     crossings = work.finish()
     work.keep_order()
@@ -187,6 +189,12 @@ class _Projector:
                 self._move(flatten(self.position, self.mesh, np.maximum(self.narrow, self.pressed)))
                 self.ease(steps=options.ease - 1)
         return options.rounds
+
+    def undo(self, start: Float[np.ndarray, "V 3"]) -> None:
+        """Take back what drove clear cloth into the skin."""
+        share = driven_in(self.position, start, self.mesh, self.near[-1].obstacle, tight=self.tight)
+        if share.any():
+            self._move(share[:, None] * (start - self.position))
 
     def keep_order(self) -> None:
         """Lift what still lies beneath an inner garment just above it, where there is no room as well.
@@ -264,12 +272,9 @@ class _Projector:
     def _lift_triangles(
         self, position: Float[np.ndarray, "V 3"], near: Sequence[Neighbour], *, gap: float | None = None
     ) -> Float[np.ndarray, "V 3"]:
-        """Lift the corners of triangles over obstacle vertices that poke through them.
+        """Lift the corners of triangles over obstacle vertices that poke through them, by ``gap`` [m].
 
-        Args:
-            position: The garment [m].
-            near: The obstacles.
-            gap: How far to lift over them [m]; by default half of the obstacle's margins.
+        By default that is half of the obstacle's margins.
         """
         lift = np.zeros_like(position)
         if not any(len(neighbour.faces) for neighbour in near):
@@ -282,13 +287,7 @@ class _Projector:
     def _crossings(
         self, neighbour: Neighbour, moved: Bool[np.ndarray, " V"], known: Int[np.ndarray, "m 2"]
     ) -> Int[np.ndarray, "n 2"]:
-        """Crossing pairs of faces that share a body part and have room.
-
-        Args:
-            neighbour: The obstacle.
-            moved: Vertices that moved since the last time.
-            known: Pairs of the last time.
-        """
+        """Crossing pairs of faces that share a part and have room; ``known`` ones from before some moved."""
         obstacle, faces = neighbour.obstacle, self.mesh.topology.faces
         beneath, stirred = obstacle.mesh.topology.faces, any_corner(moved, faces)
         mine = np.flatnonzero(any_corner(neighbour.watched, faces) & stirred)
