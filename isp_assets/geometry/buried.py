@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from isp_assets.geometry.closest import ClosestQuery
 from isp_assets.geometry.obstacle import ARMS, BODY_PARTS, CollisionMesh, Obstacle, mean_edge
 from isp_assets.geometry.spread import fade_out
-from isp_assets.geometry.winding import Winding
 
 _ABOVE = 0.001  # skin is inside the body if the point this far [m] above it is; less depth hides nothing
 _FROM, _FULL = 0.02, 0.035  # depth of skin [m] from which on its cloth is drawn to it, and lies on it
@@ -43,7 +42,7 @@ class BodyObstacle(Obstacle):
             depth[index, part] = np.where(found.on_cut, 0, (-found.height).clip(0))
         if depth.any():
             probe = self.vertices + _ABOVE * self.normals.of_vertices
-            depth[~Winding(self.vertices, faces).inside(probe)] = 0
+            depth[~self.winding.inside(probe)] = 0
         return depth
 
     @cached_property

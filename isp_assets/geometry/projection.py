@@ -287,7 +287,7 @@ class _Projector:
     def _crossings(
         self, neighbour: Neighbour, moved: Bool[np.ndarray, " V"], known: Int[np.ndarray, "m 2"]
     ) -> Int[np.ndarray, "n 2"]:
-        """Crossing pairs of faces that share a part and have room; ``known`` ones from before some moved."""
+        """Crossing pairs of faces that share a part and have room; ``known`` are those before some moved."""
         obstacle, faces = neighbour.obstacle, self.mesh.topology.faces
         beneath, stirred = obstacle.mesh.topology.faces, any_corner(moved, faces)
         mine = np.flatnonzero(any_corner(neighbour.watched, faces) & stirred)
