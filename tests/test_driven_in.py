@@ -74,10 +74,10 @@ def test_cloth_goes_back_by_its_depth_and_only_with_room(
     chosen = np.flatnonzero(sure & ~skin.winding.inside(start))[:1]
     assert len(chosen) == 1
 
-    def share(depth: float, tight: np.ndarray) -> float:
+    def share(depth: float, tight: np.ndarray, body: BodyObstacle = skin) -> float:
         position = start.copy()
         position[chosen] = found.point[chosen] - depth * found.normal[chosen]
-        return float(driven_in(position, start, tee, skin, tight=tight)[chosen[0]])
+        return float(driven_in(position, start, tee, body, tight=tight)[chosen[0]])
 
     assert share(0.0008, free) == 0
     assert 0.2 < share(0.0025, free) < 0.8
@@ -86,6 +86,10 @@ def test_cloth_goes_back_by_its_depth_and_only_with_room(
     tight[np.unique(tee.topology.faces[(tee.topology.faces == chosen[0]).any(axis=1)])] = True
     assert share(0.006, tight) == 0
     assert not driven_in(start, start, tee, skin, tight=free).any()
+    beside = BodyObstacle(skin.mesh, skin.vertices, margin=skin.margin)
+    beside.depth_in = np.zeros_like(skin.depth_in)
+    beside.depth_in[np.linalg.norm(skin.vertices - start[chosen[0]], axis=1).argmin()] = 0.01
+    assert share(0.006, free, beside) == 0  # next to skin that another part hides
 
 
 def test_skin_without_creases_sends_nothing_back() -> None:

@@ -10,16 +10,18 @@ import pytest
 import torch
 from analytic_panels import SKIRT, SKIRT_SEAMS, polygon_model
 
-from isp_assets.body import Body
+from isp_assets.body import Body, PosedBody
 from isp_assets.bundle import GarmentBundle, LayeringBundle, SkinBundle
 from isp_assets.errors import TrainError
 from isp_assets.geometry.contact import clearance
+from isp_assets.geometry.normals import vertex_normals
 from isp_assets.layering import correct_layer
 from isp_assets.networks.layering_net import LayeringConfig
 from isp_assets.networks.skin_field import SkinField, SkinFieldConfig
 from isp_assets.train import wardrobe
 from isp_assets.train.layering import LayeringOptions, LayeringTask, train_layering
 from isp_assets.train.loop import RunOptions, train
+from isp_assets.train.wearers import Wearer
 
 OPTIONS = LayeringOptions(
     network=LayeringConfig(features=4, map_size=32, levels=2),
@@ -71,6 +73,23 @@ def test_inner_layers_are_clear_of_the_body_and_carry_no_gradient(task: Layering
         assert vertices.shape[0] == len(poses)
         inside = clearance(vertices, stack.beneath[0]) < 0
         assert inside.float().mean() < 0.01
+
+
+def test_layers_that_are_turned_inside_out_still_push_outwards(
+    task: LayeringTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drape, upright = Wearer.drape, []
+
+    def mirrored(self: Wearer, posed: PosedBody, betas: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        skinned, draped = drape(self, posed, betas)
+        upright.append(vertex_normals(skinned, self.rest.faces))
+        return skinned, draped * torch.tensor([-1.0, 1, 1])
+
+    monkeypatch.setattr(Wearer, "drape", mirrored)
+    generator = torch.Generator().manual_seed(3)
+    stack = task.stack(task.wearers, torch.zeros(2, 24, 3), torch.zeros(10), generator)
+    for surface, outwards in zip(stack.beneath[1:], upright, strict=False):
+        assert ((surface.normals * outwards).sum(-1) > -1e-6).all()
 
 
 def test_losses_depend_on_the_generator_alone_and_reach_the_network(task: LayeringTask) -> None:

@@ -65,7 +65,7 @@ class Beneath:
                 the winding number says so as well: a fold may have turned the triangle over.
             body: What wears the garment; without it, no place counts as unavoidable.
         """
-        if closed and topology.border_vertex.any():
+        if closed and topology.is_open:
             raise GeometryError(
                 "a closed surface was expected, but the mesh has a border; is the body mesh complete?"
             )

@@ -233,8 +233,8 @@ class Obstacle:
         """Closest points on faces that share a part with each point.
 
         Points outside a part's box by more than ``within`` [m] are not sought there; points
-        without any candidate get height +inf, and the point itself as the closest one. So do
-        points outside of cloth whose closest triangle a fold turned over: +inf.
+        without any candidate get height +inf, and the point itself as the closest one. Points
+        outside of cloth whose closest triangle a fold turned over get height +inf too.
         """
         best = Closest(
             points.copy(), np.zeros(len(points), np.int64), np.zeros_like(points), np.zeros_like(points),

@@ -1,4 +1,4 @@
-"""The last rung of the ladder: move a garment until it touches nothing beneath it.
+"""A rung of the ladder: move a garment until it touches nothing beneath it.
 
 Contact is resolved from both sides: garment vertices are lifted off the surfaces
 beneath, and the corners of garment triangles are lifted over vertices that poke
@@ -6,8 +6,9 @@ through them. Each lift is spread over the neighbourhood and what it stretched i
 so that no spike stands out; the last rounds lift without spreading, down to the pairs
 of triangles that an exact test still finds crossing. Cloth between two body parts (an
 arm and the torso) is drawn in towards its own part. Where there is little room, margins
-shrink with it and folds are smoothed; the order of the layers is given up last of all.
-Only vertices that came near something are looked at again.
+shrink with it and folds are smoothed; clear cloth that all this drove into the skin goes
+back; the order of the layers is given up last of all. Only vertices that came near something are
+looked at again.
 
 Positions are in metres, in one shared space. NumPy, one frame and one garment at a
 time; obstacles (`Obstacle`) are the body and the finished inner garments.

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from isp_assets.errors import BodyError
+from isp_assets.geometry.winding import Winding
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ def distance_grid(
     tree = igl.AABB()
     tree.init(vertices, faces)
     distance = np.sqrt(tree.squared_distance(vertices, faces, points)[0])
-    sign = np.where(igl.fast_winding_number(vertices, faces, points) > 0.5, -1.0, 1.0)
+    sign = np.where(Winding(vertices, faces).inside(points), -1.0, 1.0)
     values = np.full(size, band)
     values[near] = np.clip(sign * distance, -band, band)
     region, _ = ndimage.label(~near)
