@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float
 from isp_assets.dressing import WornGarment
 from isp_assets.errors import DrapeError
 from isp_assets.geometry.buried import LaidCloth
-from isp_assets.geometry.obstacle import Obstacle, apart_from_arms, joined_at_hips
+from isp_assets.geometry.obstacle import Obstacle, joined_at_hips
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
-from isp_assets.geometry.relaxation import relax
+from isp_assets.geometry.relaxation import Relaxation
 
 _STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
-_PASSES, _ROUNDS = 4, 2  # at most; every pass evens out what clearing lifted after the one before
-_GENTLE = ProjectionOptions(rounds=3, ease=0, gentle=True)
+_PASSES = 6  # at most
+_FINE = ProjectionOptions(rounds=1, ease=0, finish=1, longest_move=0.001, reach=0.003, poke_reach=0.003)
 
 Obstacles = Sequence[Sequence[Obstacle]]
 """Per frame, what lies beneath: the body, then every finished layer."""
@@ -60,7 +60,7 @@ def _parts_beneath(
 def relax_layer(
     worn: WornGarment, laid: Sequence[LaidCloth], cleared: Sequence[Projection], obstacles: Obstacles
 ) -> list[Projection | None]:
-    """Relax a layer in the frames that strain it, and clear it once more.
+    """Relax a layer in the frames that strain it.
 
     Each pass goes a share of the way that grows with the strain that is left, so that cloth does not
     jump as a pose gets hard.
@@ -83,27 +83,34 @@ def relax_layer(
 def _relaxed(
     worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle]
 ) -> Projection | None:
-    mesh, own = replace(worn.collision, parts=cloth.parts), apart_from_arms(cloth.parts)
-    # Cloth without room stays where relaxing led it, as clearing would choose another side of a crease in
-    # every frame; over a layer it is cleared all the same, to keep the order.
-    stay = (done.tight | done.pressed)[:, None] & (len(beneath) == 1)
-    best, strain, position = done, worn.elastic.strain_p99(done.vertices), done.vertices
+    mesh = replace(worn.collision, parts=cloth.parts)
+    best, strain = done.vertices, worn.elastic.strain_p99(done.vertices)
+    first = _share(strain)
+    if first == 0:
+        return None
+    relaxation = Relaxation(done.vertices, worn.elastic, mesh, beneath, still=worn.tucked)
+    position = done.vertices
     for _ in range(_PASSES):
-        share = min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
-        if share == 0:
+        position = relaxation.advance(position)
+        share = _share(strain)
+        # Both states are clear of what lies beneath and near one another: so is, all but, what is between.
+        between = best + share * (position - best)
+        if (reached := worn.elastic.strain_p99(between)) < strain:
+            best, strain = between, reached
+        if strain <= _STRAINED:
             break
-        goal = relax(position, worn.elastic, mesh, beneath, still=worn.tucked, rounds=_ROUNDS)
-        clear = project(goal, worn.collision, beneath, _GENTLE, parts=own)
-        position = np.where(stay, goal, clear.vertices)
-        # A body that cuts itself deeply, or a layer, may leave no room for the state that was found.
-        if worn.elastic.strain_p99(position) >= strain:
-            continue
-        # With room, both states keep their margins and are near one another: between them little is used up.
-        between = best.vertices + share * (position - best.vertices)
-        tight, pressed = best.tight | clear.tight, best.pressed | clear.pressed
-        best = replace(clear, vertices=between, tight=tight, pressed=pressed)
-        strain = worn.elastic.strain_p99(between)
-    return None if best is done else best
+    if best is done.vertices:
+        return None
+    # Relaxing leaves cuts of tenths of a millimetre: they are lifted as far as strain allows.
+    fine = project(best, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
+    rise = max(worn.elastic.strain_p99(fine) - strain, 1e-9)
+    allowed = min(max((_OVERSTRAINED - strain) / rise, 0.0), 1.0)
+    return replace(done, vertices=best + first * allowed * (fine - best))
+
+
+def _share(strain: float) -> float:
+    """How wholly cloth of some strain is relaxed, 0 to 1."""
+    return min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
 
 
 @dataclass

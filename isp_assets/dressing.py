@@ -17,10 +17,10 @@ from isp_assets.decode import decode_garment
 from isp_assets.displacement import BoundDisplacement, anchor_ramp, bind_displacement, panel_sampler
 from isp_assets.frames import Layer
 from isp_assets.garment import Garment
+from isp_assets.geometry.elastic_cloth import ElasticCloth
 from isp_assets.geometry.energy import Fabric, cloth_rest
 from isp_assets.geometry.grading import graded_rest
 from isp_assets.geometry.obstacle import CollisionMesh
-from isp_assets.geometry.relaxation import ElasticCloth
 from isp_assets.geometry.stretch import StretchLimit
 from isp_assets.layering import BoundLayering, bind_layering
 from isp_assets.networks.drape_field import DrapeField

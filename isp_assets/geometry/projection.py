@@ -74,8 +74,6 @@ class ProjectionOptions:
     """No vertex moves further [m], or 1.1 times its depth at the start: it is caught, as if without room."""
     tolerance: float = 1e-4
     """Lifts below this [m] count as none."""
-    gentle: bool = False
-    """Every round only lifts, vertex by vertex, off own parts: for cloth that is all but clear."""
 
     def __post_init__(self) -> None:
         if self.rounds < 1 or min(self.finish, self.spread, self.ease) < 0:
@@ -176,7 +174,7 @@ class _Projector:
         """Lift vertices, and triangles once most vertices are clear; the number of rounds taken."""
         options = self.options
         for done in range(options.rounds):
-            last = options.gentle or done == options.rounds - 1
+            last = done == options.rounds - 1
             lift = self._lift_vertices(foreign=not last)
             if done > 0 or not lift.any():
                 poke = self._lift_triangles(self.position + lift, self.near)

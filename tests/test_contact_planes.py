@@ -1,0 +1,111 @@
+"""Planes that cloth stays above: their levels, whose they are, and the penalty for lying beneath."""
+
+import numpy as np
+import pytest
+from collision_shapes import LEFT_ARM, collision, obstacle, sheet
+
+from isp_assets.geometry.closest import ClosestQuery
+from isp_assets.geometry.contact_planes import Planes
+from isp_assets.geometry.obstacle import Obstacle
+
+MARGIN = 0.003
+FLOOR = sheet(41, size=0.4)
+CLOTH = sheet(11, size=0.2, height=0.002)
+ALL = np.ones((len(CLOTH[0]), 6), bool)
+
+
+def _floor(*, hidden: bool = False, joint: int = 0) -> Obstacle:
+    tight = np.ones(len(FLOOR[0]), bool) if hidden else None
+    return Obstacle(collision(FLOOR, joint), FLOOR[0], margin=MARGIN, tight=tight)
+
+
+def _each_vertex() -> np.ndarray:
+    return np.repeat(np.arange(len(CLOTH[0]))[:, None], 3, axis=1)
+
+
+def _lacking(planes: Planes, position: np.ndarray) -> np.ndarray:
+    """What each point lacks to its level [m]."""
+    place = np.einsum("nk,nkc->nc", planes.weights, position[planes.corner])
+    return planes.level - ((place - planes.point) * planes.normal).sum(axis=1)
+
+
+def test_vertices_are_asked_for_the_margin_and_middles_for_half_of_it() -> None:
+    vertices = Planes.above(CLOTH[0], _each_vertex(), _floor(), ALL)
+    middles = Planes.above(CLOTH[0], CLOTH[1], _floor(), ALL)
+    assert len(vertices.level) == len(CLOTH[0])
+    assert len(middles.level) == len(CLOTH[1])
+    np.testing.assert_allclose(_lacking(vertices, CLOTH[0]), MARGIN + 0.001 - 0.002, atol=1e-9)
+    np.testing.assert_allclose(_lacking(middles, CLOTH[0]), 0.5 * (MARGIN + 0.001) - 0.002, atol=1e-9)
+    for planes in (vertices, middles):
+        np.testing.assert_allclose(
+            planes.normal, np.broadcast_to([0, 1.0, 0], planes.normal.shape), atol=1e-9
+        )
+
+
+@pytest.mark.parametrize(("height", "wanted"), [(0.01, True), (0.05, False), (-0.05, True), (-0.07, False)])
+def test_only_what_is_near_or_not_too_deep_meets_a_plane(height: float, wanted: bool) -> None:
+    position = CLOTH[0] * [1, 0, 1] + [0, height, 0]
+    planes = Planes.above(position, _each_vertex(), _floor(), ALL)
+    assert bool(len(planes.level)) == wanted
+    if wanted:  # upwards from beneath as well
+        np.testing.assert_allclose(planes.normal[:, 1], 1, atol=1e-9)
+
+
+def test_parts_that_cloth_does_not_belong_to_are_passed_over() -> None:
+    arm = np.eye(6, dtype=bool)[np.full(len(CLOTH[0]), 2)]
+    garment = ClosestQuery(CLOTH[0], collision(CLOTH).topology)
+    concerned = np.ones(len(CLOTH[0]), bool)
+    for joint, meets in ((0, False), (LEFT_ARM, True)):
+        floor = _floor(joint=joint)
+        for planes in (
+            Planes.above(CLOTH[0], _each_vertex(), floor, arm),
+            Planes.over_vertices(garment, floor, arm, concerned=concerned),
+        ):
+            assert bool(len(planes.level)) == meets
+
+
+def test_a_vertex_that_pokes_through_a_triangle_asks_its_corners_for_room() -> None:
+    thorn = FLOOR[0].copy()
+    middle = CLOTH[0][CLOTH[1][90]].mean(axis=0)
+    tip = np.linalg.norm(thorn - middle, axis=1).argmin()
+    thorn[tip] = middle + np.array([0, 0.004, 0])
+    skin = obstacle((thorn, FLOOR[1]), margin=MARGIN)
+    garment = ClosestQuery(CLOTH[0], collision(CLOTH).topology)
+    concerned = np.ones(len(CLOTH[0]), bool)
+    planes = Planes.over_vertices(garment, skin, ALL, concerned=concerned)
+    (row,) = np.flatnonzero((planes.point == thorn[tip]).all(axis=1))
+    assert set(planes.corner[row]) == set(CLOTH[1][90])
+    np.testing.assert_allclose(planes.weights[row], 1 / 3, atol=0.02)
+    assert _lacking(planes, CLOTH[0])[row] > 0.004
+    concerned[CLOTH[1][90, 0]] = False
+    left = Planes.over_vertices(garment, skin, ALL, concerned=concerned)
+    assert not (left.point == thorn[tip]).all(axis=1).any()
+
+
+def test_cloth_over_hidden_skin_has_a_ceiling() -> None:
+    highest = np.full(len(CLOTH[0]), 0.015)
+    high = CLOTH[0] + [0, 0.02, 0]
+    planes = Planes.near_hidden(high, _each_vertex(), _floor(hidden=True), ALL, highest)
+    np.testing.assert_allclose(_lacking(planes, high), 0.022 - 0.015, atol=1e-9)
+    np.testing.assert_allclose(planes.normal[:, 1], -1, atol=1e-9)
+    assert len(Planes.near_hidden(high, _each_vertex(), _floor(), ALL, highest).level) == 0
+
+
+def test_the_penalty_is_quadratic_then_linear_and_its_gradient_is_its_own() -> None:
+    rng = np.random.default_rng(0)
+    stiffness = rng.uniform(1, 2, len(CLOTH[0]))
+    planes = Planes.joined(
+        [Planes.above(CLOTH[0], part, _floor(), ALL) for part in (_each_vertex(), CLOTH[1])]
+    )
+    penalty = planes.penalty(len(CLOTH[0]), stiffness)
+    for depth in (0.001, 0.04):
+        position = CLOTH[0] - [0, depth, 0] + 1e-4 * rng.normal(size=CLOTH[0].shape)
+        lacking = _lacking(planes, position).clip(0)
+        of_point = np.einsum("nk,nk->n", planes.weights, stiffness[planes.corner])
+        wanted = np.where(lacking < 0.025, 0.5 * lacking**2, 0.025 * (lacking - 0.0125))
+        value, gradient = penalty.energy(position)
+        assert value == pytest.approx((of_point * wanted).sum())
+        way, step = rng.normal(size=position.shape), 1e-7
+        difference = penalty.energy(position + step * way)[0] - penalty.energy(position - step * way)[0]
+        assert difference / (2 * step) == pytest.approx((gradient * way).sum(), rel=1e-4)
+    assert penalty.energy(CLOTH[0] + [0, 0.01, 0])[0] == 0

@@ -1,0 +1,54 @@
+"""The energy of cloth in NumPy: that of training, its limit of strain, and their gradients."""
+
+import numpy as np
+import pytest
+import torch
+from elastic_tube import FABRIC, SHAPE, elastic_cloth, flat_rest
+
+from isp_assets.geometry.energy import bending_energy, gravity_energy, membrane_energy
+
+
+def test_energy_and_gradient_are_those_of_the_training_energy() -> None:
+    rng = np.random.default_rng(0)
+    vertices = SHAPE[0] + 0.004 * rng.normal(size=SHAPE[0].shape)
+    value, gradient = elastic_cloth().energy(vertices)
+    place = torch.from_numpy(vertices).requires_grad_(True)
+    rest = flat_rest()
+    wanted = (
+        membrane_energy(place, rest, FABRIC)
+        + bending_energy(place, rest, FABRIC)
+        + gravity_energy(place, rest)
+    )
+    wanted.backward()
+    assert value == pytest.approx(wanted.item(), rel=1e-10)
+    np.testing.assert_allclose(gradient, place.grad.numpy(), rtol=1e-8, atol=1e-12)
+
+
+def test_flat_lengths_give_the_strain_of_uniform_stretch() -> None:
+    assert elastic_cloth().strain_p99(SHAPE[0]) < 1e-9
+    assert elastic_cloth().strain_p99(1.2 * SHAPE[0]) == pytest.approx(0.2)
+
+
+def test_strain_within_the_limit_costs_nothing_more() -> None:
+    for stretch in (0.8, 1.0, 1.2):
+        value, gradient = elastic_cloth().limit_energy(stretch * SHAPE[0])
+        assert value == 0
+        assert not gradient.any()
+
+
+@pytest.mark.parametrize("stretch", [0.5, 1.5])
+def test_uniform_strain_beyond_the_limit_costs_its_square(stretch: float) -> None:
+    """A hundred times as stiff as the membrane along an edge, beyond a strain of a quarter."""
+    cloth = elastic_cloth()
+    value, _ = cloth.limit_energy(stretch * SHAPE[0])
+    stiffness = 100 * (2 * FABRIC.mu + FABRIC.lam)
+    assert value == pytest.approx(0.5 * stiffness * cloth.area.sum() * 0.25**2, rel=1e-6)
+
+
+def test_the_gradient_of_the_limit_is_that_of_its_energy() -> None:
+    cloth, rng = elastic_cloth(), np.random.default_rng(1)
+    place = SHAPE[0] * [1.4, 0.7, 1.4] + 0.002 * rng.normal(size=SHAPE[0].shape)
+    way = rng.normal(size=place.shape)
+    step = 1e-7
+    difference = cloth.limit_energy(place + step * way)[0] - cloth.limit_energy(place - step * way)[0]
+    assert difference / (2 * step) == pytest.approx((cloth.limit_energy(place)[1] * way).sum(), rel=1e-5)
