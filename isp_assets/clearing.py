@@ -130,6 +130,8 @@ class Calm:
         cleared: list[Projection],
         obstacles: Obstacles,
         world_from_pelvis: Float[np.ndarray, "T 3 3"],
+        *,
+        relaxed: Sequence[bool],
     ) -> Float[np.ndarray, "T V 3"]:
         """Calmed positions of the next frames [m].
 
@@ -139,6 +141,7 @@ class Calm:
             cleared: Its projections.
             obstacles: What lies beneath.
             world_from_pelvis: The pelvis's rotation, with which the moves turn.
+            relaxed: The frames that relaxing changed: a whole projection would strain them anew.
         """
         short = replace(self.options, rounds=2, ease=0)
         result = np.empty((len(laid), *laid[0].vertices.shape))
@@ -150,6 +153,7 @@ class Calm:
             self.moved = moved
             calmed = before + moved @ turn.T
             parts = _parts_beneath(worn, laid[t], obstacles[t])
-            clear = project(calmed, worn.collision, obstacles[t], short, parts=parts).vertices
+            how = _FINE if relaxed[t] else short
+            clear = project(calmed, worn.collision, obstacles[t], how, parts=parts).vertices
             result[t] = np.where((done.tight | done.pressed)[:, None], calmed, clear)
         return result

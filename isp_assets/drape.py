@@ -262,6 +262,7 @@ class Draper:
             cleared = clear_layer(worn, laid, obstacles, options.projection)
         note(ran, "project", np.array([done.ran for done in cleared]))
         state.keep("project", _stacked(cleared), options.keep_stages)
+        relaxed: list[Projection | None] = [None] * len(cleared)
         if "relax" in options.steps:
             with state.timed("relax"):
                 relaxed = relax_layer(worn, laid, cleared, obstacles)
@@ -271,7 +272,8 @@ class Draper:
         if options.smoothing:
             with state.timed("project"):
                 turns = posed.joint_transforms[:, 0, :3, :3].cpu().numpy()
-                calmed = self.calm[index].follow(worn, laid, cleared, obstacles, turns)
+                changed = [found is not None for found in relaxed]
+                calmed = self.calm[index].follow(worn, laid, cleared, obstacles, turns, relaxed=changed)
             result = torch.as_tensor(calmed, dtype=torch.float32)
         return result.numpy(), [done.tight for done in cleared]
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from collision_shapes import LEFT_ARM, collision, obstacle, sheet
 
 from isp_assets.geometry.closest import ClosestQuery
@@ -17,6 +18,11 @@ ALL = np.ones((len(CLOTH[0]), 6), bool)
 def _floor(*, hidden: bool = False, joint: int = 0) -> Obstacle:
     tight = np.ones(len(FLOOR[0]), bool) if hidden else None
     return Obstacle(collision(FLOOR, joint), FLOOR[0], margin=MARGIN, tight=tight)
+
+
+def _box() -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.box((0.4, 0.3, 0.4))
+    return np.asarray(mesh.vertices) - [0, 0.15, 0], np.asarray(mesh.faces, np.int64)
 
 
 def _each_vertex() -> np.ndarray:
@@ -42,10 +48,24 @@ def test_vertices_are_asked_for_the_margin_and_middles_for_half_of_it() -> None:
         )
 
 
-@pytest.mark.parametrize(("height", "wanted"), [(0.01, True), (0.05, False), (-0.05, True), (-0.07, False)])
-def test_only_what_is_near_or_not_too_deep_meets_a_plane(height: float, wanted: bool) -> None:
-    position = CLOTH[0] * [1, 0, 1] + [0, height, 0]
-    planes = Planes.above(position, _each_vertex(), _floor(), ALL)
+@pytest.mark.parametrize(
+    ("height", "of_layer", "of_body"),
+    [
+        (0.01, True, True),
+        (0.05, False, False),
+        (-0.01, True, True),
+        (-0.05, False, True),
+        (-0.07, False, False),
+    ],
+)
+@pytest.mark.parametrize("body", [False, True])
+def test_only_what_is_near_or_not_too_deep_meets_a_plane(
+    height: float, of_layer: bool, of_body: bool, body: bool
+) -> None:
+    """The floor is a layer, or the top of a closed box."""
+    position, wanted = CLOTH[0] * [1, 0, 1] + [0, height, 0], of_body if body else of_layer
+    beneath = obstacle(_box(), margin=MARGIN) if body else _floor()
+    planes = Planes.above(position, _each_vertex(), beneath, ALL)
     assert bool(len(planes.level)) == wanted
     if wanted:  # upwards from beneath as well
         np.testing.assert_allclose(planes.normal[:, 1], 1, atol=1e-9)

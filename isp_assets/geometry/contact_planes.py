@@ -21,6 +21,7 @@ from isp_assets.geometry.obstacle import Obstacle
 
 DEEP = 0.06
 """What lies deeper than this [m] does not know its way out."""
+_BENEATH = 0.015  # the same for a layer: an open sheet has no inside that cloth could be pushed out of
 _ABOVE = 0.001  # asked for on top of the margin [m]: a penalty gives way a little
 _CHORD = 0.5  # share of the clearance asked for between vertices, as their chords cut bent surfaces
 _NEAR = 0.02  # cloth further than this above its clearance [m] meets nothing in a few steps
@@ -60,7 +61,9 @@ class Planes:
         found = surface.contacts(place, parts[corner].all(axis=1), within=DEEP)
         share = np.where(corner[:, 0] == corner[:, 1], 1.0, _CHORD)
         level = share * (surface.margin_at(found) + _ABOVE)
-        near = np.flatnonzero((found.height < level + _NEAR) & (found.height > -DEEP) & ~found.on_border)
+        deep = _BENEATH if surface.mesh.topology.is_open else DEEP
+        meets = (found.height < level + _NEAR) & (found.height > -deep) & ~found.on_border
+        near = np.flatnonzero(meets)
         # Above its level, a point is kept off by the way to it; beneath, by the surface's own normal.
         way = (place - found.point)[near] / np.maximum(np.abs(found.height[near]), 1e-9)[:, None]
         normal = np.where((found.height > level)[near, None], way, found.normal[near])

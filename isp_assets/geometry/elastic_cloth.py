@@ -22,7 +22,7 @@ from isp_assets.geometry.stretch import deformation_gradient, factored
 
 _HOLD = 3e5  # stiffness per mass with which the body holds cloth [1/s²]: a waistband gives 1 cm in a squat
 _LIMIT = 0.25  # strain of an edge beyond which cloth gets stiff
-_LIMIT_STIFFNESS = 100.0  # relative to the membrane
+_LIMIT_STIFFNESS = 150.0  # relative to the membrane
 _DAMPING = 0.05  # share of its diagonal that the matrix gains, since the membrane resists no bending
 
 
