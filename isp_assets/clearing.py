@@ -21,7 +21,10 @@ from isp_assets.geometry.obstacle import Obstacle, joined_at_hips
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
 from isp_assets.geometry.relaxation import Relaxation
 
-_STRAINED, _OVERSTRAINED = 0.28, 0.34  # strain (p99) from which cloth is relaxed a little, and wholly
+RELAXED_STRAIN = 0.28
+"""Strain (p99) from which cloth is relaxed a little."""
+_WHOLLY = 0.06  # strain above that from which it is relaxed wholly
+_LIMIT = 0.03  # how far below it edges get stiff
 _PASSES = 6  # at most
 _FINE = ProjectionOptions(rounds=1, ease=0, finish=1, longest_move=0.001, reach=0.003, poke_reach=0.003)
 
@@ -58,7 +61,12 @@ def _parts_beneath(
 
 
 def relax_layer(
-    worn: WornGarment, laid: Sequence[LaidCloth], cleared: Sequence[Projection], obstacles: Obstacles
+    worn: WornGarment,
+    laid: Sequence[LaidCloth],
+    cleared: Sequence[Projection],
+    obstacles: Obstacles,
+    *,
+    allowed: float = RELAXED_STRAIN,
 ) -> list[Projection | None]:
     """Relax a layer in the frames that strain it.
 
@@ -70,47 +78,50 @@ def relax_layer(
         laid: The layer before projection.
         cleared: Its projections.
         obstacles: What lies beneath.
+        allowed: Strain (p99) that is left alone.
 
     Returns:
         What takes the place of each projection; None where nothing does.
     """
     return [
-        _relaxed(worn, cloth, done, beneath)
+        _relaxed(worn, cloth, done, beneath, allowed)
         for cloth, done, beneath in zip(laid, cleared, obstacles, strict=True)
     ]
 
 
 def _relaxed(
-    worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle]
+    worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle], allowed: float
 ) -> Projection | None:
     mesh = replace(worn.collision, parts=cloth.parts)
     best, strain = done.vertices, worn.elastic.strain_p99(done.vertices)
-    first = _share(strain)
+    first = _share(strain - allowed)
     if first == 0:
         return None
-    relaxation = Relaxation(done.vertices, worn.elastic, mesh, beneath, still=worn.tucked)
+    relaxation = Relaxation(
+        done.vertices, worn.elastic, mesh, beneath, limit=allowed - _LIMIT, still=worn.tucked
+    )
     position = done.vertices
     for _ in range(_PASSES):
         position = relaxation.advance(position)
-        share = _share(strain)
+        share = _share(strain - allowed)
         # Both states are clear of what lies beneath and near one another: so is, all but, what is between.
         between = best + share * (position - best)
         if (reached := worn.elastic.strain_p99(between)) < strain:
             best, strain = between, reached
-        if strain <= _STRAINED:
+        if strain <= allowed:
             break
     if best is done.vertices:
         return None
     # Relaxing leaves cuts of tenths of a millimetre: they are lifted as far as strain allows.
     fine = project(best, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
     rise = max(worn.elastic.strain_p99(fine) - strain, 1e-9)
-    allowed = min(max((_OVERSTRAINED - strain) / rise, 0.0), 1.0)
-    return replace(done, vertices=best + first * allowed * (fine - best))
+    far = first * min(max((allowed + _WHOLLY - strain) / rise, 0.0), 1.0)
+    return replace(done, vertices=best + far * (fine - best))
 
 
-def _share(strain: float) -> float:
-    """How wholly cloth of some strain is relaxed, 0 to 1."""
-    return min(max((strain - _STRAINED) / (_OVERSTRAINED - _STRAINED), 0.0), 1.0)
+def _share(excess: float) -> float:
+    """How wholly cloth is relaxed that is strained by so much more than is allowed, 0 to 1."""
+    return min(max(excess / _WHOLLY, 0.0), 1.0)
 
 
 @dataclass

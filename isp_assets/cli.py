@@ -97,6 +97,9 @@ def drape(
     smoothing: Annotated[
         float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
     ] = 0.0,
+    strain: Annotated[
+        float | None, typer.Option(help="Strain (p99) from which a layer is relaxed. [default: 0.28]")
+    ] = None,
     workers: WorkersOption = None,
     resume: ResumeOption = False,
 ) -> None:
@@ -113,6 +116,8 @@ def drape(
     if write is not None:
         job = replace(job, write=split_names(write))
     options = DrapeOptions(device=_device(device), smoothing=smoothing)
+    if strain is not None:
+        options = replace(options, strain=strain)
     if steps is not None:
         options = replace(options, steps=split_names(steps))
     with _progress() as (bar, task):

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from isp_assets.body import PosedBody
-from isp_assets.clearing import Calm, clear_layer, relax_layer
+from isp_assets.clearing import RELAXED_STRAIN, Calm, clear_layer, relax_layer
 from isp_assets.conventions import NUM_JOINTS, FrameRange
 from isp_assets.displacement import displace, displacements
 from isp_assets.drape_features import drape_features
@@ -60,6 +60,8 @@ class DrapeOptions:
     smoothing: float = 0.0
     """Share of the frame before in what projection moves, 0 to below 1: calms what flickers where cloth
     is caught between surfaces, for a second, short projection a frame. Frames then depend on those before."""
+    strain: float = RELAXED_STRAIN
+    """Strain (p99) of a layer that relaxing leaves alone, .1 to .5; less costs time."""
     keep_stages: bool = False
     """Keep the positions after every rung, to measure what each one did."""
 
@@ -71,6 +73,8 @@ class DrapeOptions:
             )
         if not 0 <= self.smoothing < 1:
             raise DrapeError(f"smoothing must be at least 0 and below 1, got {self.smoothing:g}")
+        if not 0.1 <= self.strain <= 0.5:
+            raise DrapeError(f"strain must be .1 to .5, got {self.strain:g}")
         if self.chunk < 1:
             raise DrapeError(f"chunk must be at least 1 frame, got {self.chunk}")
 
@@ -265,7 +269,7 @@ class Draper:
         relaxed: list[Projection | None] = [None] * len(cleared)
         if "relax" in options.steps:
             with state.timed("relax"):
-                relaxed = relax_layer(worn, laid, cleared, obstacles)
+                relaxed = relax_layer(worn, laid, cleared, obstacles, allowed=options.strain)
             note(ran, "relax", np.array([found is not None for found in relaxed]))
             cleared = [found or done for found, done in zip(relaxed, cleared, strict=True)]
         result = _stacked(cleared)

@@ -101,6 +101,7 @@ def test_garments_lists_the_collection() -> None:
         (("drape", "{job}", "--out", "o", "--frames", "1-99999"), 3, "has frames"),
         (("drape", "{job}", "--out", "o", "--write", "fbx"), 6, "no writer plugin named 'fbx'"),
         (("drape", "{job}", "--out", "o", "--steps", "skin,glue"), 4, "steps must be some of"),
+        (("drape", "{job}", "--out", "o", "--strain", "5"), 4, "strain must be"),
         (("drape", "{job}"), 2, "Missing option"),
         (("garments", "nowhere"), 3, "no such file"),
         (("fit", "mesh", "none.obj", "-o", "c.safetensors"), 3, "no such file: none.obj"),

@@ -132,6 +132,8 @@ def test_wrong_options_and_body(outfit: Outfit, shot: Shot) -> None:
         DrapeOptions(chunk=0)
     with pytest.raises(DrapeError, match="smoothing"):
         DrapeOptions(smoothing=1.0)
+    with pytest.raises(DrapeError, match=r"strain must be \.1 to \.5, got 0\.05"):
+        DrapeOptions(strain=0.05)
     other = replace(shot, body=replace(shot.body, sha256="0" * 64))
     with pytest.raises(DrapeError, match="is not the body that the outfit"):
         drape(outfit, other)

@@ -31,7 +31,7 @@ def test_flat_lengths_give_the_strain_of_uniform_stretch() -> None:
 
 def test_strain_within_the_limit_costs_nothing_more() -> None:
     for stretch in (0.8, 1.0, 1.2):
-        value, gradient = elastic_cloth().limit_energy(stretch * SHAPE[0])
+        value, gradient = elastic_cloth().limit_energy(stretch * SHAPE[0], 0.25)
         assert value == 0
         assert not gradient.any()
 
@@ -40,7 +40,7 @@ def test_strain_within_the_limit_costs_nothing_more() -> None:
 def test_uniform_strain_beyond_the_limit_costs_its_square(stretch: float) -> None:
     """A hundred and fifty times as stiff as the membrane along an edge, beyond a strain of a quarter."""
     cloth = elastic_cloth()
-    value, _ = cloth.limit_energy(stretch * SHAPE[0])
+    value, _ = cloth.limit_energy(stretch * SHAPE[0], 0.25)
     stiffness = 150 * (2 * FABRIC.mu + FABRIC.lam)
     assert value == pytest.approx(0.5 * stiffness * cloth.area.sum() * 0.25**2, rel=1e-6)
 
@@ -50,5 +50,9 @@ def test_the_gradient_of_the_limit_is_that_of_its_energy() -> None:
     place = SHAPE[0] * [1.4, 0.7, 1.4] + 0.002 * rng.normal(size=SHAPE[0].shape)
     way = rng.normal(size=place.shape)
     step = 1e-7
-    difference = cloth.limit_energy(place + step * way)[0] - cloth.limit_energy(place - step * way)[0]
-    assert difference / (2 * step) == pytest.approx((cloth.limit_energy(place)[1] * way).sum(), rel=1e-5)
+    difference = (
+        cloth.limit_energy(place + step * way, 0.25)[0] - cloth.limit_energy(place - step * way, 0.25)[0]
+    )
+    assert difference / (2 * step) == pytest.approx(
+        (cloth.limit_energy(place, 0.25)[1] * way).sum(), rel=1e-5
+    )

@@ -155,7 +155,7 @@ def test_strain_beyond_the_limit_spreads() -> None:
     still &= start[:, 2] > 0.1
     cloth = elastic_cloth()
     after = _relaxed(start, cloth, [_body(0.05)], still=still, rounds=20)
-    assert cloth.limit_energy(after)[0] < 0.4
+    assert cloth.limit_energy(after, 0.25)[0] < 0.4
 
 
 def test_the_folds_that_cloth_has_are_kept() -> None:
@@ -222,11 +222,12 @@ def test_cloth_that_is_barely_strained_barely_moves(monkeypatch: pytest.MonkeyPa
     setup = StressSetup.load()
     outfit = Collection.load().outfit(["mini_skirt"])
     squat = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [48.0]))
-    draper = Draper(outfit, squat, DrapeOptions(resolution=48, keep_stages=True))
+    options = DrapeOptions(resolution=48, keep_stages=True)
+    draper = Draper(outfit, squat, options)
+    monkeypatch.setattr(clearing, "_WHOLLY", 0.1)
 
-    def largest_move(strained: float) -> float:
-        monkeypatch.setattr(clearing, "_STRAINED", strained)
-        monkeypatch.setattr(clearing, "_OVERSTRAINED", strained + 0.1)
+    def largest_move(allowed: float) -> float:
+        draper.options = replace(options, strain=allowed)
         chunk = draper.chunk(slice(0, 1))
         return float(np.linalg.norm(chunk.layers[0][0] - chunk.stages["project"][0][0], axis=1).max())
 
@@ -278,3 +279,17 @@ def test_small_cuts_that_relaxing_left_are_lifted(monkeypatch: pytest.MonkeyPatc
         positions.append(chunk.layers[0][0])
     assert crossing[0] < 0.95 * crossing[1]
     assert 1e-4 < np.linalg.norm(positions[0] - positions[1], axis=1).max() < 0.0035
+
+
+def test_less_strain_can_be_asked_for() -> None:
+    """Also in walking, which is left alone by default."""
+    setup = StressSetup.load()
+    outfit = Collection.load().outfit(["trousers", "tee"])
+    walk = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(50, 50)))
+    draped = drape(outfit, walk, DrapeOptions(resolution=64, strain=0.14))
+    (chunk,) = list(draped)
+    figures = FrameMeter(draped.scene).measure(chunk, 0)
+    for layer in ("L00_trousers", "L01_tee"):
+        assert figures[f"final/{layer}/strain_p99"] < 0.15
+        assert figures[f"final/{layer}/body_area_percent"] < 0.02
+    assert figures["final/L01_tee/inner_area_percent"] < 0.02

@@ -21,7 +21,6 @@ from isp_assets.geometry.grading import edge_lengths, edge_strain
 from isp_assets.geometry.stretch import deformation_gradient, factored
 
 _HOLD = 3e5  # stiffness per mass with which the body holds cloth [1/s²]: a waistband gives 1 cm in a squat
-_LIMIT = 0.25  # strain of an edge beyond which cloth gets stiff
 _LIMIT_STIFFNESS = 150.0  # relative to the membrane
 _DAMPING = 0.05  # share of its diagonal that the matrix gains, since the membrane resists no bending
 
@@ -123,15 +122,17 @@ class ElasticCloth:
         total = (self.area * density).sum() + 0.5 * (vertices * bent).sum()
         return float(total + GRAVITY * (self.mass * vertices[:, 1]).sum()), gradient
 
-    def limit_energy(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[float, Float[np.ndarray, "V 3"]]:
-        """What edges cost that are strained beyond a limit [J], and the gradient [N].
+    def limit_energy(
+        self, vertices: Float[np.ndarray, "V 3"], limit: float
+    ) -> tuple[float, Float[np.ndarray, "V 3"]]:
+        """What edges cost that are strained beyond ``limit`` [J], and the gradient [N].
 
         Stretched or pressed together: quadratic in what is beyond, so that strain spreads instead of peaking.
         """
         side, flat = self.sides @ vertices, self.flat_lengths.ravel()
         length = np.sqrt(np.einsum("nc,nc->n", side, side))
         strain = length / flat - 1
-        beyond = np.sign(strain) * (np.abs(strain) - _LIMIT).clip(0)
+        beyond = np.sign(strain) * (np.abs(strain) - limit).clip(0)
         stiffness = _LIMIT_STIFFNESS * (2 * self.fabric.mu + self.fabric.lam) * np.repeat(self.area, 3) / 3
         pull = (stiffness * beyond / (flat * np.maximum(length, 1e-9)))[:, None] * side
         return float(0.5 * (stiffness * beyond**2).sum()), self.pulls @ pull

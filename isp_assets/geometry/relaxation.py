@@ -50,6 +50,7 @@ class Relaxation:
         cloth: Its energy.
         mesh: Its collision data, with the parts that its vertices belong to in this frame.
         beneath: The body, then every inner garment.
+        limit: Strain of an edge beyond which cloth gets stiff.
         still: Vertices that stay, such as those of a hem that was pressed flat.
     """
 
@@ -60,9 +61,11 @@ class Relaxation:
         mesh: CollisionMesh,
         beneath: Sequence[Obstacle],
         *,
+        limit: float = 0.25,
         still: Bool[np.ndarray, " V"] | None = None,
     ) -> None:
         self.start, self.cloth, self.mesh = np.ascontiguousarray(start, np.float64), cloth, mesh
+        self.limit = limit
         self.still = np.zeros(len(start), bool) if still is None else still
         own, skin = apart_from_arms(mesh.parts), beneath[0]
         self.beneath = [(skin, own), *((layer, mesh.parts) for layer in beneath[1:])]
@@ -101,8 +104,12 @@ class Relaxation:
                 bent, pulled = self.cloth.bending @ moved, springs * away
                 total = 0.5 * float((moved * bent).sum() + (away * pulled).sum())
                 gradient = bent + pulled
-                for part in (self.cloth.energy, self.cloth.limit_energy, contact.energy):
-                    value, slope = part(place)
+                parts = (
+                    self.cloth.energy(place),
+                    self.cloth.limit_energy(place, self.limit),
+                    contact.energy(place),
+                )
+                for value, slope in parts:
                     total, gradient = total + value, gradient + slope
                 return total, gradient
 
