@@ -129,3 +129,14 @@ def test_the_penalty_is_quadratic_then_linear_and_its_gradient_is_its_own() -> N
         difference = penalty.energy(position + step * way)[0] - penalty.energy(position - step * way)[0]
         assert difference / (2 * step) == pytest.approx((gradient * way).sum(), rel=1e-4)
     assert penalty.energy(CLOTH[0] + [0, 0.01, 0])[0] == 0
+
+
+def test_what_is_far_away_sets_no_planes() -> None:
+    far = CLOTH[0] + [0, 0.3, 0]
+    garment = ClosestQuery(far, collision(CLOTH).topology)
+    concerned = np.ones(len(far), bool)
+    none = Planes.over_vertices(garment, _floor(), ALL, concerned=concerned)
+    assert len(none.level) == 0
+    energy, gradient = Planes.joined([none, none]).penalty(len(far), concerned.astype(float)).energy(far)
+    assert energy == 0
+    assert not gradient.any()
