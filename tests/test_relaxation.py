@@ -149,7 +149,7 @@ def test_a_vertex_beneath_lifts_the_triangle_that_it_pokes_through() -> None:
 
 
 def test_strain_beyond_the_limit_spreads() -> None:
-    """Cloth pulled at both ends over skin that holds its middle wide: the membrane alone leaves a peak."""
+    """A patch that is held wide pulls at the cloth around it: the membrane alone leaves a peak."""
     start = SHAPE[0] * np.where(np.abs(SHAPE[0][:, 1]) < 0.03, 1.6, 1.0)[:, None] ** [1, 0, 1]
     still = np.abs(start[:, 1]) < 0.03
     still &= start[:, 2] > 0.1

@@ -41,9 +41,9 @@ class Relaxation:
     """A garment of V vertices in one frame, whose energy is lowered over what lies beneath.
 
     Beyond some strain cloth gets much stiffer than its energy says, as threads do: what a pose
-    strains most hands it on to its surroundings. What is moved is bent by it as flat cloth would be, so that
-    folds are kept where their strain lets them: of many folds with much the same energy, the next
-    frame may else find others.
+    strains most hands it on to its surroundings. What is moved is bent by it as flat cloth would
+    be, so that folds are kept where their strain lets them: of many folds with much the same
+    energy, the next frame may else find others.
 
     Args:
         start: The garment in this frame, clear of what lies beneath [m].
