@@ -22,10 +22,14 @@ from isp_assets.geometry.projection import Projection, ProjectionOptions, projec
 from isp_assets.geometry.relaxation import Relaxation
 
 RELAXED_STRAIN = 0.28
-"""Strain (p99) from which cloth is relaxed a little."""
-_WHOLLY = 0.06  # strain above that from which it is relaxed wholly
-_LIMIT = 0.03  # how far below it edges get stiff
+"""Strain (p99) from which cloth is relaxed, whatever its pose and whatever it lies on."""
+_LEFT = 0.58  # share of its strain that a hard pose leaves: less of it would drive cloth into the skin
+_ON_CLOTH = (0.2, 0.5)  # shares of a layer on other cloth: it counts as lying on skin, or as wholly on cloth
+_THIN = 0.02  # cloth this near to other cloth [m] lies on it
+_LIMIT = 0.03  # how far below the strain that is left edges get stiff
+_LIFTED = 0.03  # how far above it small cuts are lifted
 _PASSES = 6  # at most
+_STEP = 0.01  # share of a way to which it is known how far strain allows
 _FINE = ProjectionOptions(rounds=1, ease=0, finish=1, longest_move=0.001, reach=0.003, poke_reach=0.003)
 
 Obstacles = Sequence[Sequence[Obstacle]]
@@ -68,17 +72,15 @@ def relax_layer(
     *,
     allowed: float = RELAXED_STRAIN,
 ) -> list[Projection | None]:
-    """Relax a layer in the frames that strain it.
-
-    Each pass goes a share of the way that grows with the strain that is left, so that cloth does not
-    jump as a pose gets hard.
+    """Relax a layer in the frames that strain it, no further than it takes.
 
     Args:
         worn: The layer.
         laid: The layer before projection.
         cleared: Its projections.
         obstacles: What lies beneath.
-        allowed: Strain (p99) that is left alone.
+        allowed: Strain (p99) that is left alone. A pose that strains a layer more may leave more, up to .28,
+            and so may other cloth that most of the layer lies on.
 
     Returns:
         What takes the place of each projection; None where nothing does.
@@ -92,36 +94,63 @@ def relax_layer(
 def _relaxed(
     worn: WornGarment, cloth: LaidCloth, done: Projection, beneath: Sequence[Obstacle], allowed: float
 ) -> Projection | None:
-    mesh = replace(worn.collision, parts=cloth.parts)
-    best, strain = done.vertices, worn.elastic.strain_p99(done.vertices)
-    first = _share(strain - allowed)
-    if first == 0:
+    strain = worn.elastic.strain_p99(done.vertices)
+    if strain <= allowed:
         return None
+    allowed = strain_left(strain, _share_on_cloth(done.vertices, cloth, beneath), allowed)
+    if strain <= allowed:
+        return None
+    mesh = replace(worn.collision, parts=cloth.parts)
     relaxation = Relaxation(
         done.vertices, worn.elastic, mesh, beneath, limit=allowed - _LIMIT, still=worn.tucked
     )
-    position = done.vertices
+    before = position = done.vertices
     for _ in range(_PASSES):
-        position = relaxation.advance(position)
-        share = _share(strain - allowed)
-        # Both states are clear of what lies beneath and near one another: so is, all but, what is between.
-        between = best + share * (position - best)
-        if (reached := worn.elastic.strain_p99(between)) < strain:
-            best, strain = between, reached
-        if strain <= allowed:
+        before, position = position, relaxation.advance(position)
+        if worn.elastic.strain_p99(position) <= allowed:
             break
-    if best is done.vertices:
-        return None
-    # Relaxing leaves cuts of tenths of a millimetre: they are lifted as far as strain allows.
-    fine = project(best, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
-    rise = max(worn.elastic.strain_p99(fine) - strain, 1e-9)
-    far = first * min(max((allowed + _WHOLLY - strain) / rise, 0.0), 1.0)
-    return replace(done, vertices=best + far * (fine - best))
+    # Relaxing leaves cuts of tenths of a millimetre.
+    fine = project(position, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
+    position = _as_far(worn, position, fine, allowed + _LIFTED)
+    # Back to where strain is just low enough: so cloth does not jump as a pose gets hard.
+    return replace(done, vertices=_as_far(worn, position, before, allowed))
 
 
-def _share(excess: float) -> float:
-    """How wholly cloth is relaxed that is strained by so much more than is allowed, 0 to 1."""
-    return min(max(excess / _WHOLLY, 0.0), 1.0)
+def strain_left(strain: float, on_cloth: float, allowed: float) -> float:
+    """Strain (p99) that relaxing a layer leaves; not below ``allowed``, not above that or .28.
+
+    Args:
+        strain: What it has.
+        on_cloth: Share of it that lies on other cloth.
+        allowed: What is asked for.
+    """
+    most = max(allowed, RELAXED_STRAIN)
+    low, high = _ON_CLOTH
+    covered = min(max((on_cloth - low) / (high - low), 0.0), 1.0)
+    return max(allowed + covered * (most - allowed), min(_LEFT * strain, most))
+
+
+def _share_on_cloth(
+    vertices: Float[np.ndarray, "V 3"], cloth: LaidCloth, beneath: Sequence[Obstacle]
+) -> float:
+    """Share of a layer's vertices that lie on inner layers."""
+    covered = np.zeros(len(vertices), bool)
+    for layer in beneath[1:]:
+        found = layer.contacts(vertices, cloth.parts, within=_THIN)
+        covered |= (np.abs(found.height) < _THIN) & ~found.on_border
+    return float(covered.mean())
+
+
+def _as_far(
+    worn: WornGarment, start: Float[np.ndarray, "V 3"], end: Float[np.ndarray, "V 3"], allowed: float
+) -> Float[np.ndarray, "V 3"]:
+    """As far from the start to the end as strain allows; the start where it allows nothing."""
+    share, step = 0.0, 1.0
+    while step > _STEP and share < 1:
+        if worn.elastic.strain_p99(start + (share + step) * (end - start)) <= allowed:
+            share += step
+        step /= 2
+    return start + share * (end - start)
 
 
 @dataclass

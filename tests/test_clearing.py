@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from isp_assets.body import Body
-from isp_assets.clearing import Calm, clear_layer
+from isp_assets.clearing import RELAXED_STRAIN, Calm, clear_layer, strain_left
 from isp_assets.collection import Collection
 from isp_assets.conventions import FrameRange
 from isp_assets.drape import DrapeOptions, drape
@@ -167,3 +169,29 @@ def test_calming_does_not_strain_anew_what_was_relaxed() -> None:
         assert figures["final/L00_trousers/body_area_percent"] < 0.1
         strain[smoothing] = figures["final/L00_trousers/strain_p99"]
     assert strain[0.5] < strain[0.0] + 0.03
+
+
+_SHARES = st.floats(0, 1, allow_subnormal=False)
+
+
+@given(st.floats(0.1, 1), _SHARES, st.floats(0.1, 0.5), st.floats(0, 0.02, allow_subnormal=False))
+def test_the_strain_that_relaxing_leaves_is_steady_and_within_its_bounds(
+    strain: float, on_cloth: float, allowed: float, more: float
+) -> None:
+    left = strain_left(strain, on_cloth, allowed)
+    assert allowed <= left <= max(allowed, RELAXED_STRAIN)
+    for changed in (
+        strain_left(strain + more, on_cloth, allowed),
+        strain_left(strain, on_cloth + more, allowed),
+    ):
+        assert 0 <= changed - left + 1e-12 < more + 1e-9
+
+
+def test_strain_is_left_to_hard_poses_and_on_other_cloth() -> None:
+    assert strain_left(0.2, 0.0, 0.15) == 0.15
+    assert strain_left(0.2, 1.0, 0.15) == RELAXED_STRAIN
+    assert 0.15 < strain_left(0.35, 0.0, 0.15) < RELAXED_STRAIN
+    assert strain_left(0.9, 0.0, 0.15) == RELAXED_STRAIN
+    for strain, on_cloth in ((0.3, 0.0), (0.9, 1.0)):
+        assert strain_left(strain, on_cloth, RELAXED_STRAIN) == RELAXED_STRAIN
+        assert strain_left(strain, on_cloth, 0.4) == 0.4

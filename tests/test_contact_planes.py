@@ -6,7 +6,7 @@ import trimesh
 from collision_shapes import LEFT_ARM, collision, obstacle, sheet
 
 from isp_assets.geometry.closest import ClosestQuery
-from isp_assets.geometry.contact_planes import Planes
+from isp_assets.geometry.contact_planes import Planes, nearest
 from isp_assets.geometry.obstacle import Obstacle
 
 MARGIN = 0.003
@@ -29,6 +29,10 @@ def _each_vertex() -> np.ndarray:
     return np.repeat(np.arange(len(CLOTH[0]))[:, None], 3, axis=1)
 
 
+def _above(position: np.ndarray, corner: np.ndarray, surface: Obstacle, parts: np.ndarray = ALL) -> Planes:
+    return Planes.above(position, corner, surface, nearest(position, corner, surface, parts))
+
+
 def _lacking(planes: Planes, position: np.ndarray) -> np.ndarray:
     """What each point lacks to its level [m]."""
     place = np.einsum("nk,nkc->nc", planes.weights, position[planes.corner])
@@ -36,8 +40,8 @@ def _lacking(planes: Planes, position: np.ndarray) -> np.ndarray:
 
 
 def test_vertices_are_asked_for_the_margin_and_middles_for_half_of_it() -> None:
-    vertices = Planes.above(CLOTH[0], _each_vertex(), _floor(), ALL)
-    middles = Planes.above(CLOTH[0], CLOTH[1], _floor(), ALL)
+    vertices = _above(CLOTH[0], _each_vertex(), _floor())
+    middles = _above(CLOTH[0], CLOTH[1], _floor())
     assert len(vertices.level) == len(CLOTH[0])
     assert len(middles.level) == len(CLOTH[1])
     np.testing.assert_allclose(_lacking(vertices, CLOTH[0]), MARGIN + 0.001 - 0.002, atol=1e-9)
@@ -65,7 +69,7 @@ def test_only_what_is_near_or_not_too_deep_meets_a_plane(
     """The floor is a layer, or the top of a closed box."""
     position, wanted = CLOTH[0] * [1, 0, 1] + [0, height, 0], of_body if body else of_layer
     beneath = obstacle(_box(), margin=MARGIN) if body else _floor()
-    planes = Planes.above(position, _each_vertex(), beneath, ALL)
+    planes = _above(position, _each_vertex(), beneath)
     assert bool(len(planes.level)) == wanted
     if wanted:  # upwards from beneath as well
         np.testing.assert_allclose(planes.normal[:, 1], 1, atol=1e-9)
@@ -78,7 +82,7 @@ def test_parts_that_cloth_does_not_belong_to_are_passed_over() -> None:
     for joint, meets in ((0, False), (LEFT_ARM, True)):
         floor = _floor(joint=joint)
         for planes in (
-            Planes.above(CLOTH[0], _each_vertex(), floor, arm),
+            _above(CLOTH[0], _each_vertex(), floor, arm),
             Planes.over_vertices(garment, floor, arm, concerned=concerned),
         ):
             assert bool(len(planes.level)) == meets
@@ -105,18 +109,21 @@ def test_a_vertex_that_pokes_through_a_triangle_asks_its_corners_for_room() -> N
 def test_cloth_over_hidden_skin_has_a_ceiling() -> None:
     highest = np.full(len(CLOTH[0]), 0.015)
     high = CLOTH[0] + [0, 0.02, 0]
-    planes = Planes.near_hidden(high, _each_vertex(), _floor(hidden=True), ALL, highest)
+    vertices = _each_vertex()
+
+    def ceiling(floor: Obstacle) -> Planes:
+        return Planes.near_hidden(high, vertices, floor, nearest(high, vertices, floor, ALL), highest)
+
+    planes = ceiling(_floor(hidden=True))
     np.testing.assert_allclose(_lacking(planes, high), 0.022 - 0.015, atol=1e-9)
     np.testing.assert_allclose(planes.normal[:, 1], -1, atol=1e-9)
-    assert len(Planes.near_hidden(high, _each_vertex(), _floor(), ALL, highest).level) == 0
+    assert len(ceiling(_floor()).level) == 0
 
 
 def test_the_penalty_is_quadratic_then_linear_and_its_gradient_is_its_own() -> None:
     rng = np.random.default_rng(0)
     stiffness = rng.uniform(1, 2, len(CLOTH[0]))
-    planes = Planes.joined(
-        [Planes.above(CLOTH[0], part, _floor(), ALL) for part in (_each_vertex(), CLOTH[1])]
-    )
+    planes = Planes.joined([_above(CLOTH[0], part, _floor()) for part in (_each_vertex(), CLOTH[1])])
     penalty = planes.penalty(len(CLOTH[0]), stiffness)
     for depth in (0.001, 0.04):
         position = CLOTH[0] - [0, depth, 0] + 1e-4 * rng.normal(size=CLOTH[0].shape)

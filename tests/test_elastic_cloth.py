@@ -45,14 +45,25 @@ def test_uniform_strain_beyond_the_limit_costs_its_square(stretch: float) -> Non
     assert value == pytest.approx(0.5 * stiffness * cloth.area.sum() * 0.25**2, rel=1e-6)
 
 
-def test_the_gradient_of_the_limit_is_that_of_its_energy() -> None:
+def test_sides_may_resist_being_pressed_less_than_being_stretched() -> None:
+    cloth = elastic_cloth()
+    share = np.full(len(cloth.flat_lengths) * 3, 0.1)
+    for stretch, wanted in ((0.5, 0.1), (1.5, 1.0)):
+        whole, gradient = cloth.limit_energy(stretch * SHAPE[0], 0.25)
+        value, less = cloth.limit_energy(stretch * SHAPE[0], 0.25, pressed=share)
+        assert value == pytest.approx(wanted * whole)
+        np.testing.assert_allclose(less, wanted * gradient, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("pressed", [1.0, 0.03])
+def test_the_gradient_of_the_limit_is_that_of_its_energy(pressed: float) -> None:
     cloth, rng = elastic_cloth(), np.random.default_rng(1)
     place = SHAPE[0] * [1.4, 0.7, 1.4] + 0.002 * rng.normal(size=SHAPE[0].shape)
     way = rng.normal(size=place.shape)
     step = 1e-7
-    difference = (
-        cloth.limit_energy(place + step * way, 0.25)[0] - cloth.limit_energy(place - step * way, 0.25)[0]
-    )
-    assert difference / (2 * step) == pytest.approx(
-        (cloth.limit_energy(place, 0.25)[1] * way).sum(), rel=1e-5
-    )
+
+    def limited(place: np.ndarray) -> tuple[float, np.ndarray]:
+        return cloth.limit_energy(place, 0.25, pressed=pressed)
+
+    difference = limited(place + step * way)[0] - limited(place - step * way)[0]
+    assert difference / (2 * step) == pytest.approx((limited(place)[1] * way).sum(), rel=1e-5)

@@ -142,7 +142,7 @@ def test_a_vertex_beneath_lifts_the_triangle_that_it_pokes_through() -> None:
     thorn = np.linalg.norm(skin[0] - middle, axis=1).argmin()
     skin[0][thorn] = middle * [1.06, 1, 1.06]
     body = obstacle(skin)
-    after = _relaxed(start, elastic_cloth(), [body])
+    after = _relaxed(start, elastic_cloth(start[:, 1] > 0.19), [body])
     found = ClosestQuery(after, collision(SHAPE).topology)(skin[0][[thorn]])
     assert ClosestQuery(start, collision(SHAPE).topology)(skin[0][[thorn]]).height > 0.004
     assert found.height < 0
@@ -159,11 +159,11 @@ def test_strain_beyond_the_limit_spreads() -> None:
 
 
 def test_the_folds_that_cloth_has_are_kept() -> None:
-    """Shallow pleats down a tube cost no strain that matters: relaxing does not iron them."""
+    """Shallow pleats down a tube that hangs cost no strain that matters: relaxing does not iron them."""
     start = SHAPE[0].copy()
     start[:, [0, 2]] *= (1 + 0.01 * (-1.0) ** np.arange(40)[None].repeat(21, axis=0).reshape(-1))[:, None]
     start[:, 1] += 0.02 * np.exp(-((start[:, 1] / 0.05) ** 2))
-    cloth = elastic_cloth()
+    cloth = elastic_cloth(SHAPE[0][:, 1] > 0.19)
     moved = _relaxed(start, cloth, [_body(0.08)], rounds=20) - start
     assert (moved * (cloth.bending @ moved)).sum() < 0.002
     assert cloth.strain_p99(start + moved) < 0.5 * cloth.strain_p99(start)
@@ -184,6 +184,40 @@ def test_cloth_over_hidden_skin_does_not_come_out_elsewhere() -> None:
     )
     assert open_ > SKIN + 0.018
     assert shut < SKIN + 0.0165
+
+
+def test_an_easy_pose_is_held_near_its_start_and_a_hard_one_is_not() -> None:
+    """Much the same strain is left, by shorter ways."""
+    start, held = _bunched(), SHAPE[0][:, 1] > 0.19
+    cloth, moves = elastic_cloth(held), []
+    for limit in (0.25, 0.12):
+        relaxation = Relaxation(start, cloth, collision(SHAPE), [_body(0.08)], limit=limit)
+        after = relaxation.advance(start, rounds=10)
+        assert cloth.strain_p99(after) < 0.5 * cloth.strain_p99(start)
+        moves.append(float(np.linalg.norm(after - start, axis=1).mean()))
+    assert moves[1] < 0.95 * moves[0]
+
+
+def test_contact_gets_stiffer_as_the_limit_gets_lower() -> None:
+    beneath = [_body()]
+    easy, hard = (
+        Relaxation(SHAPE[0], elastic_cloth(), collision(SHAPE), beneath, limit=limit).stiffness
+        for limit in (0.125, 0.25)
+    )
+    np.testing.assert_allclose(easy, 4 * hard)
+
+
+def test_cloth_pressed_together_is_not_forced_apart_where_there_is_little_room() -> None:
+    """A wall in front of part of the skin: beneath it, pressed cloth resists a low limit less."""
+    body, wall = tube(SKIN, low=-0.4, high=0.4, columns=80), tube(SKIN + 0.0105, low=-0.02, high=0.02)
+    vertices = np.concatenate([body[0], wall[0]])
+    faces = np.concatenate([body[1], wall[1][:, ::-1] + len(body[0])])
+    skin = obstacle((vertices, faces))
+    for limit, wanted in ((0.12, 0.03), (0.25, 1.0)):
+        relaxation = Relaxation(SHAPE[0], elastic_cloth(), collision(SHAPE), [skin], limit=limit)
+        high = SHAPE[0][elastic_cloth().faces][:, :, 1].mean(axis=1).repeat(3)
+        np.testing.assert_array_equal(relaxation.pressed[np.abs(high) < 0.015], wanted)
+        np.testing.assert_array_equal(relaxation.pressed[np.abs(high) > 0.05], 1)
 
 
 def test_all_but_the_arms_count_as_one() -> None:
@@ -218,24 +252,38 @@ def test_a_deep_squat_is_relaxed_and_walking_is_left_alone() -> None:
     assert "relax" not in chunk.steps[0][0]
 
 
-def test_cloth_that_is_barely_strained_barely_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cloth_moves_no_further_than_its_strain_asks_for() -> None:
+    """Barely strained, it barely moves; and what is asked for is met, not undercut."""
     setup = StressSetup.load()
     outfit = Collection.load().outfit(["mini_skirt"])
     squat = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [48.0]))
-    options = DrapeOptions(resolution=48, keep_stages=True)
-    draper = Draper(outfit, squat, options)
-    monkeypatch.setattr(clearing, "_WHOLLY", 0.1)
-
-    def largest_move(allowed: float) -> float:
-        draper.options = replace(options, strain=allowed)
+    draper = Draper(outfit, squat, DrapeOptions(resolution=48, keep_stages=True))
+    elastic = draper.worn[0].elastic
+    strain = elastic.strain_p99(draper.chunk(slice(0, 1)).stages["project"][0][0])
+    moves = []
+    for allowed in (strain - 0.05, strain - 0.001, strain):
+        draper.options = replace(draper.options, strain=allowed)
         chunk = draper.chunk(slice(0, 1))
-        return float(np.linalg.norm(chunk.layers[0][0] - chunk.stages["project"][0][0], axis=1).max())
+        assert allowed - 0.01 < elastic.strain_p99(chunk.layers[0][0]) <= allowed + 1e-6
+        moves.append(float(np.linalg.norm(chunk.layers[0][0] - chunk.stages["project"][0][0], axis=1).max()))
+    assert moves[0] > 0.005
+    assert moves[1] < 0.1 * moves[0]
+    assert moves[2] == 0
 
-    strain = draper.worn[0].elastic.strain_p99(draper.chunk(slice(0, 1)).stages["project"][0][0])
-    wholly = largest_move(strain - 0.1)
-    assert wholly > 0.01
-    assert largest_move(strain - 0.001) < 0.05 * wholly
-    assert largest_move(strain) < 1e-6
+
+def test_a_layer_on_other_cloth_keeps_strain_that_one_on_skin_does_not() -> None:
+    setup = StressSetup.load()
+    shot = Shot("arms", setup.body, stress_motions.arms_swept(setup.figure, [0.0]))
+    outfit = Collection.load().outfit(["long_sleeved_shirt", "open_jacket"])
+    draper = Draper(outfit, shot, DrapeOptions(resolution=48, strain=0.15, keep_stages=True))
+    chunk = draper.chunk(slice(0, 1))
+    before, after = (
+        [worn.elastic.strain_p99(stage[0]) for worn, stage in zip(draper.worn, stages, strict=True)]
+        for stages in (chunk.stages["project"], chunk.layers)
+    )
+    assert min(before) > 0.2
+    assert after[0] < 0.18
+    assert after[1] > 0.2
 
 
 def test_a_tucked_hem_stays_where_it_was_pressed() -> None:
@@ -282,14 +330,14 @@ def test_small_cuts_that_relaxing_left_are_lifted(monkeypatch: pytest.MonkeyPatc
 
 
 def test_less_strain_can_be_asked_for() -> None:
-    """Also in walking, which is left alone by default."""
+    """Also where it is left alone by default: arms that hang, sleeves along the torso."""
     setup = StressSetup.load()
     outfit = Collection.load().outfit(["trousers", "tee"])
-    walk = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(50, 50)))
-    draped = drape(outfit, walk, DrapeOptions(resolution=64, strain=0.14))
+    shot = Shot("arms", setup.body, stress_motions.arms_swept(setup.figure, [0.0]))
+    draped = drape(outfit, shot, DrapeOptions(resolution=64, strain=0.15))
     (chunk,) = list(draped)
     figures = FrameMeter(draped.scene).measure(chunk, 0)
     for layer in ("L00_trousers", "L01_tee"):
-        assert figures[f"final/{layer}/strain_p99"] < 0.15
+        assert figures[f"final/{layer}/strain_p99"] < 0.17
         assert figures[f"final/{layer}/body_area_percent"] < 0.02
     assert figures["final/L01_tee/inner_area_percent"] < 0.02

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from isp_assets.geometry.closest import ClosestQuery
+from isp_assets.geometry.closest import Closest, ClosestQuery
 from isp_assets.geometry.obstacle import Obstacle
 
 DEEP = 0.06
@@ -28,6 +28,23 @@ _NEAR = 0.02  # cloth further than this above its clearance [m] meets nothing in
 _DEPTH = 0.025  # lacking clearance beyond which the penalty grows linearly [m]
 _POKE = 0.015  # a vertex that pokes through a triangle further than this [m] does not count
 _FACING = 0.25  # cosine from which a triangle and what pokes through it face the same way
+
+
+def nearest(
+    position: Float[np.ndarray, "V 3"],
+    corner: Int[np.ndarray, "n 3"],
+    surface: Obstacle,
+    parts: Bool[np.ndarray, "V 6"],
+) -> Closest:
+    """The nearest places of a surface, if not too far away.
+
+    Args:
+        position: The garment [m].
+        corner: The triangles whose middles are looked up; a vertex is given three times.
+        surface: What lies beneath.
+        parts: Body parts whose surface each vertex lies over; a middle, those of all its corners.
+    """
+    return surface.contacts(position[corner].mean(axis=1), parts[corner].all(axis=1), within=DEEP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +64,7 @@ class Planes:
         position: Float[np.ndarray, "V 3"],
         corner: Int[np.ndarray, "n 3"],
         surface: Obstacle,
-        parts: Bool[np.ndarray, "V 6"],
+        found: Closest,
     ) -> "Planes":
         """Planes through the nearest places of a surface.
 
@@ -55,10 +72,9 @@ class Planes:
             position: The garment [m].
             corner: The triangles whose middles are to stay above; a vertex is given three times.
             surface: What lies beneath.
-            parts: Body parts whose surface each vertex stays above; a middle, those of all its corners.
+            found: Their `nearest` places on it.
         """
         place = position[corner].mean(axis=1)
-        found = surface.contacts(place, parts[corner].all(axis=1), within=DEEP)
         share = np.where(corner[:, 0] == corner[:, 1], 1.0, _CHORD)
         level = share * (surface.margin_at(found) + _ABOVE)
         deep = _BENEATH if surface.mesh.topology.is_open else DEEP
@@ -101,7 +117,7 @@ class Planes:
         position: Float[np.ndarray, "V 3"],
         corner: Int[np.ndarray, "n 3"],
         skin: Obstacle,
-        parts: Bool[np.ndarray, "V 6"],
+        found: Closest,
         highest: Float[np.ndarray, " V"],
     ) -> "Planes":
         """Planes that cloth over hidden skin stays beneath: unseen, it must not come out elsewhere.
@@ -110,11 +126,10 @@ class Planes:
             position: The garment [m].
             corner: Its vertices, each three times.
             skin: The body.
-            parts: Body parts that each vertex lies over.
+            found: Their `nearest` places on it.
             highest: How high over hidden skin each vertex may come [m].
         """
         index = corner[:, 0]
-        found = skin.contacts(position[index], parts[index], within=DEEP)
         hidden = skin.blocked[skin.mesh.topology.faces[found.face]].any(axis=1)
         cap = highest[index]
         high = np.flatnonzero(hidden & np.isfinite(found.height) & (found.height > (cap - _NEAR).clip(0)))

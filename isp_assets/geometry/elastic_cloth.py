@@ -123,16 +123,26 @@ class ElasticCloth:
         return float(total + GRAVITY * (self.mass * vertices[:, 1]).sum()), gradient
 
     def limit_energy(
-        self, vertices: Float[np.ndarray, "V 3"], limit: float
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        limit: float,
+        *,
+        pressed: Float[np.ndarray, " n"] | float = 1.0,
     ) -> tuple[float, Float[np.ndarray, "V 3"]]:
         """What edges cost that are strained beyond ``limit`` [J], and the gradient [N].
 
         Stretched or pressed together: quadratic in what is beyond, so that strain spreads instead of peaking.
+
+        Args:
+            vertices: Positions [m].
+            limit: Strain, as relative change of length.
+            pressed: Share of the stiffness with which each of ``sides`` resists being pressed together.
         """
         side, flat = self.sides @ vertices, self.flat_lengths.ravel()
         length = np.sqrt(np.einsum("nc,nc->n", side, side))
         strain = length / flat - 1
         beyond = np.sign(strain) * (np.abs(strain) - limit).clip(0)
         stiffness = _LIMIT_STIFFNESS * (2 * self.fabric.mu + self.fabric.lam) * np.repeat(self.area, 3) / 3
+        stiffness = stiffness * np.where(strain < 0, pressed, 1.0)
         pull = (stiffness * beyond / (flat * np.maximum(length, 1e-9)))[:, None] * side
         return float(0.5 * (stiffness * beyond**2).sum()), self.pulls @ pull

@@ -4,37 +4,32 @@ Projection looks at one vertex at a time and eases what it strained close by. Wh
 a whole garment, as a deep squat does its seat, the cloth has to move as a whole. That is a
 minimum of its energy (membrane, bending, gravity) over planes through the nearest skin and the
 nearest cloth of every layer beneath (`contact_planes`), which are looked up anew after every few
-steps. Each step is one of L-BFGS, whose first guess of the inverse Hessian is the constant matrix
-of projective dynamics, factored once a garment.
+steps (`quasi_newton`) around the constant matrix of projective dynamics, factored once a garment.
 
 Positions are in metres, Y up, in one shared space. NumPy, one frame at a time.
-
-Reference: Liu, Bouaziz and Kavan, "Quasi-Newton Methods for Real-Time Simulation of
-Hyperelastic Materials", ACM Transactions on Graphics 36(3), 2017.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import ClosestQuery
-from isp_assets.geometry.contact_planes import DEEP, Penalty, Planes
+from isp_assets.geometry.closest import Closest, ClosestQuery
+from isp_assets.geometry.contact_planes import DEEP, Penalty, Planes, nearest
 from isp_assets.geometry.elastic_cloth import ElasticCloth
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
+from isp_assets.geometry.quasi_newton import QuasiNewton
 
-_CONTACT = 4e6  # stiffness of contact per mass [1/s²]
+_HARD, _EASY = 0.25, 0.12  # limits of strain, for poses that strain cloth a lot and a little
+_CONTACT = 4e6  # stiffness of contact per mass [1/s²] in a hard pose; lower limits press harder
+_STEADY = 3e4  # stiffness per mass [1/s²] of springs to the start in an easy pose: it has many minima
+_NARROW = 0.97  # share of the margin: where room leaves less, skin is close to other skin
+_ON_SKIN = 0.01  # cloth this near to skin [m] lies on it
+_LEAST_PRESSED = 0.03  # share of the limit's stiffness that pressed cloth has there, in an easy pose
 _AROUND = 0.02  # another limb further than this [m] does not press on cloth
 _CAUGHT = 0.002  # cloth this near to the margin of another limb [m] stays where it is
 _OVER_HIDDEN = 0.006  # cloth over hidden skin may come as high as it was, or this high [m]
-_MEMORY = 10  # steps that L-BFGS remembers
-_SHORTENINGS = 12  # halvings of a step that does not lower the energy
-_DESCENT = 1e-4  # share of the promised decrease that a step must bring
-_SETTLED = 1e-7  # decrease [J] below which nothing more happens
-
-Energy = Callable[[Float[np.ndarray, "V 3"]], tuple[float, Float[np.ndarray, "V 3"]]]
-"""Energy [J] of positions, and its gradient [N]."""
 
 
 class Relaxation:
@@ -44,6 +39,10 @@ class Relaxation:
     strains most hands it on to its surroundings. What is moved is bent by it as flat cloth would
     be, so that folds are kept where their strain lets them: of many folds with much the same
     energy, the next frame may else find others.
+
+    The lower the limit, the easier the pose: contact gets stiffer, as cloth presses harder; springs to
+    the start keep frames alike; and cloth that is pressed together where there is little room, as in an
+    armpit, is not forced apart, since its way out would lead into the skin.
 
     Args:
         start: The garment in this frame, clear of what lies beneath [m].
@@ -61,19 +60,24 @@ class Relaxation:
         mesh: CollisionMesh,
         beneath: Sequence[Obstacle],
         *,
-        limit: float = 0.25,
+        limit: float = _HARD,
         still: Bool[np.ndarray, " V"] | None = None,
     ) -> None:
         self.start, self.cloth, self.mesh = np.ascontiguousarray(start, np.float64), cloth, mesh
         self.limit = limit
+        hard = float(np.clip((limit - _EASY) / (_HARD - _EASY), 0, 1))
         self.still = np.zeros(len(start), bool) if still is None else still
         own, skin = apart_from_arms(mesh.parts), beneath[0]
         self.beneath = [(skin, own), *((layer, mesh.parts) for layer in beneath[1:])]
-        self.stiffness = _CONTACT * cloth.mass
-        self.highest = skin.contacts(self.start, own, within=DEEP).height.clip(_OVER_HIDDEN, DEEP)
+        self.stiffness = _CONTACT * (_HARD / limit) ** 2 * cloth.mass
+        self.hold = np.maximum(cloth.hold, (1 - hard) * _STEADY * cloth.mass)
+        found = skin.contacts(self.start, own, within=DEEP)
+        self.highest = found.height.clip(_OVER_HIDDEN, DEEP)
+        self.pressed = self._pressed(found, max(np.sqrt(hard), _LEAST_PRESSED))
+        self._solver = QuasiNewton(cloth.solver.solve)
 
     def advance(
-        self, position: Float[np.ndarray, "V 3"], *, rounds: int = 4, steps: int = 10
+        self, position: Float[np.ndarray, "V 3"], *, rounds: int = 3, steps: int = 10
     ) -> Float[np.ndarray, "V 3"]:
         """Lower the energy further.
 
@@ -92,7 +96,7 @@ class Relaxation:
             raise GeometryError(f"relaxing needs at least 1 round and 1 step, got {rounds} and {steps}")
         position = np.ascontiguousarray(position, np.float64)
         moves = ~(self._caught(position) | self.still)
-        springs = np.where(moves, self.cloth.hold, self.stiffness)[:, None]
+        springs = np.where(moves, self.hold, self.stiffness)[:, None]
         home = np.where(moves[:, None], self.start, position)
         for _ in range(rounds):
             contact = self._contact(position, moves)
@@ -106,15 +110,23 @@ class Relaxation:
                 gradient = bent + pulled
                 parts = (
                     self.cloth.energy(place),
-                    self.cloth.limit_energy(place, self.limit),
+                    self.cloth.limit_energy(place, self.limit, pressed=self.pressed),
                     contact.energy(place),
                 )
                 for value, slope in parts:
                     total, gradient = total + value, gradient + slope
                 return total, gradient
 
-            position = _descend(position, energy, self.cloth, steps=steps)
+            position = self._solver.descend(position, energy, steps=steps)
         return position
+
+    def _pressed(self, found: Closest, narrow: float) -> Float[np.ndarray, " n"]:
+        """How firmly each of the cloth's sides resists being pressed together: less in narrow places."""
+        skin, _ = self.beneath[0]
+        squeezed = (found.height < _ON_SKIN) & (skin.margin_at(found) < _NARROW * skin.margin)
+        faces = self.mesh.topology.faces
+        either = (squeezed[faces] | squeezed[np.roll(faces, -1, axis=1)]).ravel()
+        return np.where(either, narrow, 1.0)
 
     def _caught(self, position: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
         """Vertices that another limb presses on."""
@@ -129,52 +141,15 @@ class Relaxation:
         faces = faces[moves[faces].all(axis=1)]
         garment = ClosestQuery(position, self.mesh.topology)
         (skin, own), *layers = self.beneath
-        planes = [Planes.above(position, vertices, *on) for on in self.beneath]
-        planes += [Planes.above(position, faces, *on) for on in layers]
+        on_skin = nearest(position, vertices, skin, own)
+        planes = [
+            Planes.above(position, vertices, skin, on_skin),
+            Planes.near_hidden(position, vertices, skin, on_skin, self.highest),
+        ]
+        planes += [
+            Planes.above(position, corner, layer, nearest(position, corner, layer, parts))
+            for layer, parts in layers
+            for corner in (vertices, faces)
+        ]
         planes += [Planes.over_vertices(garment, *on, concerned=moves) for on in self.beneath]
-        planes += [Planes.near_hidden(position, vertices, skin, own, self.highest)]
         return Planes.joined(planes).penalty(len(position), self.stiffness)
-
-
-def _descend(
-    position: Float[np.ndarray, "V 3"], energy: Energy, cloth: ElasticCloth, *, steps: int
-) -> Float[np.ndarray, "V 3"]:
-    """Some steps of L-BFGS, each shortened until it lowers the energy."""
-    history: list[tuple[np.ndarray, np.ndarray, float]] = []
-    value, gradient = energy(position)
-    for _ in range(steps):
-        direction = _direction(gradient, history, cloth)
-        slope = float((gradient * direction).sum())
-        if slope >= 0:
-            break
-        for halving in range(_SHORTENINGS):
-            step = 0.5**halving * direction
-            reached, turned = energy(position + step)
-            if reached <= value + _DESCENT * 0.5**halving * slope:
-                break
-        else:
-            break
-        change = turned - gradient
-        curvature = float((step * change).sum())
-        if curvature > 0:
-            history = [*history[1 - _MEMORY :], (step, change, 1 / curvature)]
-        gain, position, value, gradient = value - reached, position + step, reached, turned
-        if gain < _SETTLED:
-            break
-    return position
-
-
-def _direction(
-    gradient: Float[np.ndarray, "V 3"],
-    history: list[tuple[np.ndarray, np.ndarray, float]],
-    cloth: ElasticCloth,
-) -> Float[np.ndarray, "V 3"]:
-    """The two-loop recursion of L-BFGS around the factored matrix."""
-    left, shares = gradient.copy(), []
-    for step, change, weight in reversed(history):
-        shares.append(weight * float((step * left).sum()))
-        left -= shares[-1] * change
-    direction = cloth.solver.solve(left)
-    for (step, change, weight), share in zip(history, reversed(shares), strict=True):
-        direction += (share - weight * float((change * direction).sum())) * step
-    return -direction
