@@ -27,7 +27,7 @@ _LEFT = 0.58  # share of its strain that a hard pose leaves: less of it would dr
 _ON_CLOTH = (0.2, 0.5)  # shares of a layer on other cloth: it counts as lying on skin, or as wholly on cloth
 _THIN = 0.02  # cloth this near to other cloth [m] lies on it
 _LIMIT = 0.03  # how far below the strain that is left edges get stiff
-_LIFTED = 0.03  # how far above it small cuts are lifted
+_LIFTED = 0.02  # how far above it small cuts are lifted
 _PASSES = 6  # at most
 _STEP = 0.01  # share of a way to which it is known how far strain allows
 _FINE = ProjectionOptions(rounds=1, ease=0, finish=1, longest_move=0.001, reach=0.003, poke_reach=0.003)
@@ -109,11 +109,15 @@ def _relaxed(
         before, position = position, relaxation.advance(position)
         if worn.elastic.strain_p99(position) <= allowed:
             break
-    # Relaxing leaves cuts of tenths of a millimetre.
-    fine = project(position, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
-    position = _as_far(worn, position, fine, allowed + _LIFTED)
     # Back to where strain is just low enough: so cloth does not jump as a pose gets hard.
-    return replace(done, vertices=_as_far(worn, position, before, allowed))
+    back = _share_of_way(worn, position, before, allowed)
+    position = position + back * (before - position)
+    # Relaxing leaves cuts of tenths of a millimetre; what hardly moved needs no more lifting than before.
+    fine = project(position, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
+    lift = _share_of_way(worn, position, fine, allowed + _LIFTED)
+    if before is done.vertices:
+        lift *= 1 - back
+    return replace(done, vertices=position + lift * (fine - position))
 
 
 def strain_left(strain: float, on_cloth: float, allowed: float) -> float:
@@ -141,16 +145,16 @@ def _share_on_cloth(
     return float(covered.mean())
 
 
-def _as_far(
+def _share_of_way(
     worn: WornGarment, start: Float[np.ndarray, "V 3"], end: Float[np.ndarray, "V 3"], allowed: float
-) -> Float[np.ndarray, "V 3"]:
-    """As far from the start to the end as strain allows; the start where it allows nothing."""
+) -> float:
+    """How far from the start to the end strain allows to go, 0 to 1; 0 where it allows nothing."""
     share, step = 0.0, 1.0
     while step > _STEP and share < 1:
         if worn.elastic.strain_p99(start + (share + step) * (end - start)) <= allowed:
             share += step
         step /= 2
-    return start + share * (end - start)
+    return share
 
 
 @dataclass
