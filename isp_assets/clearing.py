@@ -116,7 +116,7 @@ def _relaxed(
     fine = project(position, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
     lift = _share_of_way(worn, position, fine, allowed + _LIFTED)
     if before is done.vertices:
-        lift *= 1 - back
+        lift *= min(4 * (1 - back), 1.0)
     return replace(done, vertices=position + lift * (fine - position))
 
 
