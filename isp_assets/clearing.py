@@ -97,9 +97,10 @@ def _relaxed(
     strain = worn.elastic.strain_p99(done.vertices)
     if strain <= allowed:
         return None
-    allowed = strain_left(strain, _share_on_cloth(done.vertices, cloth, beneath), allowed)
-    if strain <= allowed:
-        return None
+    if allowed < RELAXED_STRAIN:
+        allowed = strain_left(strain, _share_on_cloth(done.vertices, cloth, beneath), allowed)
+        if strain <= allowed:
+            return None
     mesh = replace(worn.collision, parts=cloth.parts)
     relaxation = Relaxation(
         done.vertices, worn.elastic, mesh, beneath, limit=allowed - _LIMIT, still=worn.tucked
