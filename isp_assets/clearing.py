@@ -106,10 +106,14 @@ def _relaxed(
         done.vertices, worn.elastic, mesh, beneath, limit=allowed - _LIMIT, still=worn.tucked
     )
     before = position = done.vertices
+    reached = strain
     for _ in range(_PASSES):
         before, position = position, relaxation.advance(position)
-        if worn.elastic.strain_p99(position) <= allowed:
+        reached = worn.elastic.strain_p99(position)
+        if reached <= allowed:
             break
+    if reached >= strain:
+        return None
     # Back to where strain is just low enough: so cloth does not jump as a pose gets hard.
     back = _share_of_way(worn, position, before, allowed)
     position = position + back * (before - position)

@@ -284,6 +284,17 @@ def test_cloth_moves_no_further_than_its_strain_asks_for() -> None:
     assert moves[2] == 0
 
 
+def test_what_relaxing_does_not_help_stays_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A state of lower energy may have higher strain."""
+    setup = StressSetup.load()
+    shot = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [48.0]))
+    monkeypatch.setattr(Relaxation, "advance", lambda relaxation, position: 1.1 * position)
+    options = DrapeOptions(resolution=48, keep_stages=True)
+    (chunk,) = list(drape(Collection.load().outfit(["mini_skirt"]), shot, options))
+    assert "relax" not in chunk.steps[0][0]
+    np.testing.assert_array_equal(chunk.layers[0], chunk.stages["project"][0])
+
+
 def test_a_layer_on_other_cloth_keeps_strain_that_one_on_skin_does_not() -> None:
     setup = StressSetup.load()
     shot = Shot("arms", setup.body, stress_motions.arms_swept(setup.figure, [0.0]))
