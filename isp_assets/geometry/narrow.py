@@ -6,7 +6,7 @@ the folds. Positions are in metres. NumPy, one frame at a time.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from isp_assets.geometry.closest import Closest
 from isp_assets.geometry.obstacle import NO_ROOM, CollisionMesh, Obstacle, mean_edge
@@ -15,6 +15,7 @@ from isp_assets.geometry.stretch import StretchLimit
 
 _ROOM = 0.008  # from this room [m] on cloth keeps its folds
 _BESIDE = 0.01  # cloth this near [m] to the place has its room; twice as far, it is not concerned
+_WHOLE = 0.97  # share of the margin: where room leaves less, other skin is near
 _LEAST = 0.83  # share of its size to which cloth without room may shrink: stretched out, it would buckle
 _AROUND = 0.12  # the same in part for cloth within this distance [m] of it
 _LEAST_AT_BORDER = 0.68  # the same at an open border: nothing holds it back from going into the body
@@ -37,6 +38,16 @@ def narrowness(obstacle: Obstacle, found: Closest) -> Float[np.ndarray, " P"]:
     room = obstacle.room[obstacle.mesh.topology.faces[found.face]].min(axis=1)
     beside = (2 - np.abs(found.height) / _BESIDE).clip(0, 1)
     return beside * ((_ROOM - room) / (_ROOM - NO_ROOM)).clip(0, 1)
+
+
+def squeezed(obstacle: Obstacle, found: Closest) -> Bool[np.ndarray, " P"]:
+    """Points on a surface over which room leaves less than the margin; a wider circle than `narrowness`.
+
+    Args:
+        obstacle: What lies beneath.
+        found: The points' closest points on it.
+    """
+    return (found.height < _BESIDE) & (obstacle.margin_at(found) < _WHOLE * obstacle.margin)
 
 
 def crumpled(

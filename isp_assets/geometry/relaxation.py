@@ -4,7 +4,8 @@ Projection looks at one vertex at a time and eases what it strained close by. Wh
 a whole garment, as a deep squat does its seat, the cloth has to move as a whole. That is a
 minimum of its energy (membrane, bending, gravity) over planes through the nearest skin and the
 nearest cloth of every layer beneath (`contact_planes`), which are looked up anew after every few
-steps (`quasi_newton`) around the constant matrix of projective dynamics, factored once a garment.
+steps of L-BFGS (`quasi_newton`) around the constant matrix of projective dynamics, factored once a
+garment.
 
 Positions are in metres, Y up, in one shared space. NumPy, one frame at a time.
 """
@@ -15,18 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from isp_assets.errors import GeometryError
-from isp_assets.geometry.closest import Closest, ClosestQuery
+from isp_assets.geometry.closest import ClosestQuery
 from isp_assets.geometry.contact_planes import DEEP, Penalty, Planes, nearest
 from isp_assets.geometry.elastic_cloth import ElasticCloth
+from isp_assets.geometry.narrow import squeezed
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
 from isp_assets.geometry.quasi_newton import QuasiNewton
 
 _HARD, _EASY = 0.25, 0.12  # limits of strain, for poses that strain cloth a lot and a little
 _CONTACT = 4e6  # stiffness of contact per mass [1/s²] in a hard pose; lower limits press harder
 _STEADY = 3e4  # stiffness per mass [1/s²] of springs to the start in an easy pose: it has many minima
-_NARROW = 0.97  # share of the margin: where room leaves less, skin is close to other skin
-_ON_SKIN = 0.01  # cloth this near to skin [m] lies on it
-_LEAST_PRESSED = 0.03  # share of the limit's stiffness that pressed cloth has there, in an easy pose
+_LEAST_PRESSED = 0.03  # share of the limit's stiffness that squeezed cloth has, in an easy pose
 _AROUND = 0.02  # another limb further than this [m] does not press on cloth
 _CAUGHT = 0.002  # cloth this near to the margin of another limb [m] stays where it is
 _OVER_HIDDEN = 0.006  # cloth over hidden skin may come as high as it was, or this high [m]
@@ -73,7 +73,7 @@ class Relaxation:
         self.hold = np.maximum(cloth.hold, (1 - hard) * _STEADY * cloth.mass)
         found = skin.contacts(self.start, own, within=DEEP)
         self.highest = found.height.clip(_OVER_HIDDEN, DEEP)
-        self.pressed = self._pressed(found, max(np.sqrt(hard), _LEAST_PRESSED))
+        self.pressed = self._pressed(squeezed(skin, found), max(np.sqrt(hard), _LEAST_PRESSED))
         self._solver = QuasiNewton(cloth.solver.solve)
 
     def advance(
@@ -120,13 +120,11 @@ class Relaxation:
             position = self._solver.descend(position, energy, steps=steps)
         return position
 
-    def _pressed(self, found: Closest, narrow: float) -> Float[np.ndarray, " n"]:
-        """How firmly each of the cloth's sides resists being pressed together: less in narrow places."""
-        skin, _ = self.beneath[0]
-        squeezed = (found.height < _ON_SKIN) & (skin.margin_at(found) < _NARROW * skin.margin)
+    def _pressed(self, narrow: Bool[np.ndarray, " V"], share: float) -> Float[np.ndarray, " n"]:
+        """How firmly each of the cloth's sides resists being pressed together: a share in narrow places."""
         faces = self.mesh.topology.faces
-        either = (squeezed[faces] | squeezed[np.roll(faces, -1, axis=1)]).ravel()
-        return np.where(either, narrow, 1.0)
+        either = (narrow[faces] | narrow[np.roll(faces, -1, axis=1)]).ravel()
+        return np.where(either, share, 1.0)
 
     def _caught(self, position: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
         """Vertices that another limb presses on."""
