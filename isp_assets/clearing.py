@@ -21,9 +21,10 @@ from isp_assets.geometry.obstacle import Obstacle, joined_at_hips
 from isp_assets.geometry.projection import Projection, ProjectionOptions, project
 from isp_assets.geometry.relaxation import Relaxation
 
-RELAXED_STRAIN = 0.28
-"""Strain (p99) from which cloth is relaxed, whatever its pose and whatever it lies on."""
-_LEFT = 0.58  # share of its strain that a hard pose leaves: less of it would drive cloth into the skin
+RELAXED_STRAIN = 0.14
+"""Strain (p99) of a layer that is left alone, if not told otherwise."""
+MOST_LEFT = 0.28  # strain from which cloth is relaxed, whatever its pose and whatever it lies on
+_HARD = (0.26, 0.34)  # strains from which a pose counts as hard, and as wholly so: it leaves the most
 _ON_CLOTH = (0.2, 0.5)  # shares of a layer on other cloth: it counts as lying on skin, or as wholly on cloth
 _THIN = 0.02  # cloth this near to other cloth [m] lies on it
 _LIMIT = 0.03  # how far below the strain that is left edges get stiff
@@ -97,7 +98,7 @@ def _relaxed(
     strain = worn.elastic.strain_p99(done.vertices)
     if strain <= allowed:
         return None
-    if allowed < RELAXED_STRAIN:
+    if allowed < MOST_LEFT:
         allowed = strain_left(strain, _share_on_cloth(done.vertices, cloth, beneath), allowed)
         if strain <= allowed:
             return None
@@ -105,6 +106,9 @@ def _relaxed(
     relaxation = Relaxation(
         done.vertices, worn.elastic, mesh, beneath, limit=allowed - _LIMIT, still=worn.tucked
     )
+    allowed = max(allowed, min(relaxation.least_strain(allowed), MOST_LEFT))
+    if strain <= allowed:
+        return None
     before = position = done.vertices
     reached = strain
     for _ in range(_PASSES):
@@ -133,10 +137,14 @@ def strain_left(strain: float, on_cloth: float, allowed: float) -> float:
         on_cloth: Share of it that lies on other cloth.
         allowed: What is asked for.
     """
-    most = max(allowed, RELAXED_STRAIN)
-    low, high = _ON_CLOTH
-    covered = min(max((on_cloth - low) / (high - low), 0.0), 1.0)
-    return max(allowed + covered * (most - allowed), min(_LEFT * strain, most))
+    most = max(allowed, MOST_LEFT)
+    share = max(_ramp(strain, *_HARD), _ramp(on_cloth, *_ON_CLOTH))
+    return allowed + share * (most - allowed)
+
+
+def _ramp(value: float, low: float, high: float) -> float:
+    """0 up to ``low``, 1 from ``high`` on."""
+    return min(max((value - low) / (high - low), 0.0), 1.0)
 
 
 def _share_on_cloth(

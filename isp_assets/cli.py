@@ -98,7 +98,8 @@ def drape(
         float, typer.Option(help="Share of the frame before in what projection moves; .5 calms flicker.")
     ] = 0.0,
     strain: Annotated[
-        float | None, typer.Option(help="Strain (p99) from which a layer is relaxed. [default: 0.28]")
+        float | None,
+        typer.Option(help="Strain (p99) from which a layer is relaxed; .28 is faster. [default: 0.14]"),
     ] = None,
     workers: WorkersOption = None,
     resume: ResumeOption = False,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from isp_assets.body import Body
-from isp_assets.clearing import RELAXED_STRAIN, Calm, clear_layer, strain_left
+from isp_assets.clearing import MOST_LEFT, Calm, clear_layer, strain_left
 from isp_assets.collection import Collection
 from isp_assets.conventions import FrameRange
 from isp_assets.drape import DrapeOptions, drape
@@ -179,19 +179,19 @@ def test_the_strain_that_relaxing_leaves_is_steady_and_within_its_bounds(
     strain: float, on_cloth: float, allowed: float, more: float
 ) -> None:
     left = strain_left(strain, on_cloth, allowed)
-    assert allowed <= left <= max(allowed, RELAXED_STRAIN)
+    assert allowed <= left <= max(allowed, MOST_LEFT)
     for changed in (
         strain_left(strain + more, on_cloth, allowed),
         strain_left(strain, on_cloth + more, allowed),
     ):
-        assert 0 <= changed - left + 1e-12 < more + 1e-9
+        assert 0 <= changed - left + 1e-12 < 2.5 * more + 1e-9
 
 
 def test_strain_is_left_to_hard_poses_and_on_other_cloth() -> None:
     assert strain_left(0.2, 0.0, 0.15) == 0.15
-    assert strain_left(0.2, 1.0, 0.15) == RELAXED_STRAIN
-    assert 0.15 < strain_left(0.35, 0.0, 0.15) < RELAXED_STRAIN
-    assert strain_left(0.9, 0.0, 0.15) == RELAXED_STRAIN
+    assert strain_left(0.2, 1.0, 0.15) == MOST_LEFT
+    assert 0.15 < strain_left(0.3, 0.0, 0.15) < MOST_LEFT
+    assert strain_left(0.9, 0.0, 0.15) == MOST_LEFT
     for strain, on_cloth in ((0.3, 0.0), (0.9, 1.0)):
-        assert strain_left(strain, on_cloth, RELAXED_STRAIN) == RELAXED_STRAIN
+        assert strain_left(strain, on_cloth, MOST_LEFT) == MOST_LEFT
         assert strain_left(strain, on_cloth, 0.4) == 0.4

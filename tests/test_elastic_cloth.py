@@ -31,26 +31,27 @@ def test_flat_lengths_give_the_strain_of_uniform_stretch() -> None:
 
 def test_strain_within_the_limit_costs_nothing_more() -> None:
     for stretch in (0.8, 1.0, 1.2):
-        value, gradient = elastic_cloth().limit_energy(stretch * SHAPE[0], 0.25)
+        value, gradient = elastic_cloth().limit_energy(stretch * SHAPE[0], 0.25, stiffness=150.0)
         assert value == 0
         assert not gradient.any()
 
 
 @pytest.mark.parametrize("stretch", [0.5, 1.5])
-def test_uniform_strain_beyond_the_limit_costs_its_square(stretch: float) -> None:
-    """A hundred and fifty times as stiff as the membrane along an edge, beyond a strain of a quarter."""
+@pytest.mark.parametrize("stiffness", [150.0, 1000.0])
+def test_uniform_strain_beyond_the_limit_costs_its_square(stretch: float, stiffness: float) -> None:
+    """So many times as stiff as the membrane along an edge, beyond a strain of a quarter."""
     cloth = elastic_cloth()
-    value, _ = cloth.limit_energy(stretch * SHAPE[0], 0.25)
-    stiffness = 150 * (2 * FABRIC.mu + FABRIC.lam)
-    assert value == pytest.approx(0.5 * stiffness * cloth.area.sum() * 0.25**2, rel=1e-6)
+    value, _ = cloth.limit_energy(stretch * SHAPE[0], 0.25, stiffness=stiffness)
+    wanted = 0.5 * stiffness * (2 * FABRIC.mu + FABRIC.lam) * cloth.area.sum() * 0.25**2
+    assert value == pytest.approx(wanted, rel=1e-6)
 
 
 def test_sides_may_resist_being_pressed_less_than_being_stretched() -> None:
     cloth = elastic_cloth()
     share = np.full(len(cloth.flat_lengths) * 3, 0.1)
     for stretch, wanted in ((0.5, 0.1), (1.5, 1.0)):
-        whole, gradient = cloth.limit_energy(stretch * SHAPE[0], 0.25)
-        value, less = cloth.limit_energy(stretch * SHAPE[0], 0.25, pressed=share)
+        whole, gradient = cloth.limit_energy(stretch * SHAPE[0], 0.25, stiffness=150.0)
+        value, less = cloth.limit_energy(stretch * SHAPE[0], 0.25, stiffness=150.0, pressed=share)
         assert value == pytest.approx(wanted * whole)
         np.testing.assert_allclose(less, wanted * gradient, rtol=1e-9, atol=1e-12)
 
@@ -63,7 +64,7 @@ def test_the_gradient_of_the_limit_is_that_of_its_energy(pressed: float) -> None
     step = 1e-7
 
     def limited(place: np.ndarray) -> tuple[float, np.ndarray]:
-        return cloth.limit_energy(place, 0.25, pressed=pressed)
+        return cloth.limit_energy(place, 0.25, stiffness=150.0, pressed=pressed)
 
     difference = limited(place + step * way)[0] - limited(place - step * way)[0]
     assert difference / (2 * step) == pytest.approx((limited(place)[1] * way).sum(), rel=1e-5)

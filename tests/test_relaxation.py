@@ -9,6 +9,7 @@ from collision_shapes import LEFT_ARM, collision, obstacle, tube
 from elastic_tube import SHAPE, elastic_cloth
 
 from isp_assets import clearing
+from isp_assets.clearing import MOST_LEFT
 from isp_assets.collection import Collection
 from isp_assets.conventions import FrameRange
 from isp_assets.drape import DrapeOptions, Draper, drape
@@ -17,6 +18,7 @@ from isp_assets.errors import GeometryError
 from isp_assets.evaluate import stress_motions
 from isp_assets.evaluate.frames import FrameMeter
 from isp_assets.evaluate.stress_setup import StressSetup
+from isp_assets.evaluate.temporal import jerk_ratio, skin_beneath
 from isp_assets.geometry.closest import ClosestQuery
 from isp_assets.geometry.elastic_cloth import ElasticCloth
 from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
@@ -49,6 +51,13 @@ def _bunched() -> np.ndarray:
 
 def _body(radius: float = SKIN) -> Obstacle:
     return obstacle(tube(radius, low=-0.4, high=0.4, columns=80))
+
+
+def _narrow_body(gap: float = 0.006) -> Obstacle:
+    """Skin, and a wall this far in front of part of it [m]."""
+    body, wall = tube(SKIN, low=-0.4, high=0.4, columns=80), tube(SKIN + gap, low=-0.02, high=0.02)
+    vertices = np.concatenate([body[0], wall[0]])
+    return obstacle((vertices, np.concatenate([body[1], wall[1][:, ::-1] + len(body[0])])))
 
 
 def test_strained_cloth_slides_over_the_skin() -> None:
@@ -124,6 +133,97 @@ def test_cloth_that_an_arm_presses_on_stays_where_it_was_put() -> None:
     assert pressed[under].max() < 0.2 * free[under].max()
 
 
+def _beside_an_arm(gap: float) -> Obstacle:
+    """The skin of `SKIN`, and an arm around part of it that ends this far outside of `SHAPE` [m]."""
+    body, arm = _body(), obstacle(tube(0.104 + gap, low=-0.03, high=0.03, columns=80), joint=LEFT_ARM)
+    faces = np.concatenate([body.mesh.topology.faces, arm.mesh.topology.faces[:, ::-1] + len(body.vertices)])
+    weights = np.zeros((len(body.vertices) + len(arm.vertices), 24))
+    weights[: len(body.vertices), 0] = weights[len(body.vertices) :, LEFT_ARM] = 1
+    vertices = np.concatenate([body.vertices, arm.vertices])
+    return Obstacle(CollisionMesh.build(faces, weights), vertices, margin=0.003)
+
+
+def test_in_an_easy_pose_cloth_is_held_the_more_firmly_the_nearer_an_arm_is() -> None:
+    """Steadily: an arm that goes by does not grip cloth at once. In a hard pose it does."""
+    under = np.abs(SHAPE[0][:, 1]) < 0.015
+    held = {limit: [] for limit in (0.12, 0.25)}
+    for gap in np.linspace(0.004, 0.016, 13):
+        for limit, found in held.items():
+            relaxation = Relaxation(
+                SHAPE[0], elastic_cloth(), collision(SHAPE), [_beside_an_arm(gap)], limit=limit
+            )
+            found.append(relaxation.held_at(SHAPE[0])[under].mean())
+    easy, hard = (np.array(found) for found in held.values())
+    assert easy[0] == hard[0] == 1
+    assert easy[-1] == hard[-1] == 0
+    assert (np.diff(easy) <= 1e-9).all()
+    assert -np.diff(easy).min() < 0.25
+    assert -np.diff(hard).min() > 0.5
+
+
+def test_cloth_without_room_is_held_in_an_easy_pose_and_may_move_in_a_hard_one() -> None:
+    skin = _narrow_body()
+    near, far = (np.abs(SHAPE[0][:, 1]) < 0.01), np.abs(SHAPE[0][:, 1]) > 0.05
+    for limit, wanted in ((0.12, 0.3), (0.25, 0.0)):
+        relaxation = Relaxation(SHAPE[0], elastic_cloth(), collision(SHAPE), [skin], limit=limit)
+        held = relaxation.held_at(SHAPE[0])
+        assert held[near].min() >= wanted
+        assert not held[far].any()
+        assert wanted or not held.any()
+
+
+def test_the_moves_of_an_easy_pose_are_smoother() -> None:
+    """Pressed together, cloth gives way in wide bows, not in folds that the next frame has elsewhere."""
+    rng = np.random.default_rng(0)
+    start = SHAPE[0] * [1, 0.8, 1] + 0.003 * rng.normal(size=SHAPE[0].shape)
+    ends, cloth, rough = np.abs(start[:, 1]) > 0.13, elastic_cloth(), []
+    for bent in (1, 100):
+        relaxation = Relaxation(start, cloth, collision(SHAPE), [_body(0.08)], limit=0.12, still=ends)
+        np.testing.assert_allclose(relaxation.bending.toarray(), (101 * cloth.bending).toarray())
+        relaxation.bending = bent * cloth.bending
+        moved = relaxation.advance(start, rounds=10) - start
+        rough.append((moved * (cloth.bending @ moved)).sum() / (moved * moved).sum())
+    assert rough[1] < 0.5 * rough[0]
+
+
+def test_tucked_cloth_keeps_its_strain_and_all_other_cloth_none() -> None:
+    start = SHAPE[0] * [1, 1.3, 1]
+    cloth, mesh, body = elastic_cloth(), collision(SHAPE), [_body(0.08)]
+    few, many = SHAPE[0][:, 1] > 0.19, SHAPE[0][:, 1] > 0
+    assert Relaxation(start, cloth, mesh, body).least_strain(0.15) == 0.15
+    assert Relaxation(start, cloth, mesh, body, still=many).least_strain(0.15) == pytest.approx(0.3)
+    assert Relaxation(start, cloth, mesh, body, still=many).least_strain(0.4) == 0.4
+    peak = cloth.strain_p99(start)
+    assert Relaxation(start, cloth, mesh, body, still=few).least_strain(0.15) <= peak
+
+
+def test_cloth_around_an_armhole_keeps_its_strain() -> None:
+    """An open edge with an arm beside it, on the torso; at a cuff, far from it, there is none."""
+    start = SHAPE[0] * [1, 1.3, 1]
+    for gap, wanted in ((0.004, 0.3), (0.02, 0.15)):
+        skin = _beside_an_arm(gap)
+        arm = skin.vertices[len(_body().vertices) :]
+        arm[:, 1] += start[:, 1].max()
+        skin = Obstacle(skin.mesh, skin.vertices, margin=skin.margin)
+        relaxation = Relaxation(start, elastic_cloth(), collision(SHAPE), [skin], limit=0.12)
+        assert relaxation.least_strain(0.15) == pytest.approx(wanted)
+        of_arm = collision(SHAPE, joint=LEFT_ARM)
+        assert Relaxation(start, elastic_cloth(), of_arm, [skin], limit=0.12).least_strain(0.15) == 0.15
+
+
+def test_less_strain_costs_hardly_any_calm() -> None:
+    """Sleeves along the torso: where cloth goes must not depend on small things."""
+    setup = StressSetup.load()
+    shot = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(40, 55)))
+    outfit, jerks = Collection.load().outfit(["v_neck_shirt"]), []
+    for strain in (0.15, 0.5):
+        (chunk,) = list(drape(outfit, shot, DrapeOptions(resolution=64, strain=strain, chunk=16)))
+        assert all(("relax" in layers[0]) == (strain < 0.5) for layers in chunk.steps)
+        layer, body = chunk.layers[0], chunk.body
+        jerks.append(jerk_ratio(layer, body[:, skin_beneath(layer[0], body[0])], shot.motion.fps))
+    assert jerks[0] < 1.15 * jerks[1]
+
+
 def test_cloth_that_is_to_stay_still_stays() -> None:
     start = _bunched()
     still = np.abs(start[:, 1]) < 0.05
@@ -155,7 +255,7 @@ def test_strain_beyond_the_limit_spreads() -> None:
     still &= start[:, 2] > 0.1
     cloth = elastic_cloth()
     after = _relaxed(start, cloth, [_body(0.05)], still=still, rounds=20)
-    assert cloth.limit_energy(after, 0.25)[0] < 0.4
+    assert cloth.limit_energy(after, 0.25, stiffness=150.0)[0] < 0.4
 
 
 def test_the_folds_that_cloth_has_are_kept() -> None:
@@ -208,11 +308,8 @@ def test_contact_gets_stiffer_as_the_limit_gets_lower() -> None:
 
 
 def test_cloth_pressed_together_is_not_forced_apart_where_there_is_little_room() -> None:
-    """A wall in front of part of the skin: beneath it, pressed cloth resists a low limit less."""
-    body, wall = tube(SKIN, low=-0.4, high=0.4, columns=80), tube(SKIN + 0.0105, low=-0.02, high=0.02)
-    vertices = np.concatenate([body[0], wall[0]])
-    faces = np.concatenate([body[1], wall[1][:, ::-1] + len(body[0])])
-    skin = obstacle((vertices, faces))
+    """Beneath the wall, pressed cloth resists a low limit less."""
+    skin = _narrow_body(0.0105)
     for limit, wanted in ((0.12, 0.03), (0.25, 1.0)):
         relaxation = Relaxation(SHAPE[0], elastic_cloth(), collision(SHAPE), [skin], limit=limit)
         high = SHAPE[0][elastic_cloth().faces][:, :, 1].mean(axis=1).repeat(3)
@@ -253,7 +350,8 @@ def test_a_deep_squat_is_relaxed_and_walking_is_left_alone() -> None:
     setup = StressSetup.load()
     outfit = Collection.load().outfit(["mini_skirt"])
     squat = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [10.0, 48.0]))
-    (chunk,) = list(drape(outfit, squat, DrapeOptions(resolution=64, keep_stages=True)))
+    options = DrapeOptions(resolution=64, strain=MOST_LEFT, keep_stages=True)
+    (chunk,) = list(drape(outfit, squat, options))
     assert [("relax" in layers[0]) for layers in chunk.steps] == [False, True]
     worn = dress(outfit, setup.body, torch.zeros(10), resolution=64)[0].elastic
     before, after = (worn.strain_p99(stage[0][1]) for stage in (chunk.stages["project"], chunk.layers))
@@ -261,7 +359,7 @@ def test_a_deep_squat_is_relaxed_and_walking_is_left_alone() -> None:
     assert after < 0.3
     np.testing.assert_array_equal(chunk.layers[0][0], chunk.stages["project"][0][0])
     walk = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(50, 50)))
-    (chunk,) = list(drape(outfit, walk, DrapeOptions(resolution=64)))
+    (chunk,) = list(drape(outfit, walk, options))
     assert "relax" not in chunk.steps[0][0]
 
 
@@ -354,7 +452,7 @@ def test_small_cuts_that_relaxing_left_are_lifted(monkeypatch: pytest.MonkeyPatc
 
 
 def test_less_strain_can_be_asked_for() -> None:
-    """Also where it is left alone by default: arms that hang, sleeves along the torso."""
+    """Arms that hang, sleeves along the torso: what they press on gives way the least."""
     setup = StressSetup.load()
     outfit = Collection.load().outfit(["trousers", "tee"])
     shot = Shot("arms", setup.body, stress_motions.arms_swept(setup.figure, [0.0]))
@@ -362,6 +460,6 @@ def test_less_strain_can_be_asked_for() -> None:
     (chunk,) = list(draped)
     figures = FrameMeter(draped.scene).measure(chunk, 0)
     for layer in ("L00_trousers", "L01_tee"):
-        assert figures[f"final/{layer}/strain_p99"] < 0.17
+        assert figures[f"final/{layer}/strain_p99"] < 0.18
         assert figures[f"final/{layer}/body_area_percent"] < 0.02
     assert figures["final/L01_tee/inner_area_percent"] < 0.02

@@ -21,7 +21,6 @@ from isp_assets.geometry.grading import edge_lengths, edge_strain
 from isp_assets.geometry.stretch import deformation_gradient, factored
 
 _HOLD = 3e5  # stiffness per mass with which the body holds cloth [1/s²]: a waistband gives 1 cm in a squat
-_LIMIT_STIFFNESS = 150.0  # relative to the membrane
 _DAMPING = 0.05  # share of its diagonal that the matrix gains, since the membrane resists no bending
 
 
@@ -127,6 +126,7 @@ class ElasticCloth:
         vertices: Float[np.ndarray, "V 3"],
         limit: float,
         *,
+        stiffness: float,
         pressed: Float[np.ndarray, " n"] | float = 1.0,
     ) -> tuple[float, Float[np.ndarray, "V 3"]]:
         """What edges cost that are strained beyond ``limit`` [J], and the gradient [N].
@@ -136,13 +136,14 @@ class ElasticCloth:
         Args:
             vertices: Positions [m].
             limit: Strain, as relative change of length.
+            stiffness: Of what is beyond it, relative to the membrane.
             pressed: Share of the stiffness with which each of ``sides`` resists being pressed together.
         """
         side, flat = self.sides @ vertices, self.flat_lengths.ravel()
         length = np.sqrt(np.einsum("nc,nc->n", side, side))
         strain = length / flat - 1
         beyond = np.sign(strain) * (np.abs(strain) - limit).clip(0)
-        stiffness = _LIMIT_STIFFNESS * (2 * self.fabric.mu + self.fabric.lam) * np.repeat(self.area, 3) / 3
-        stiffness = stiffness * np.where(strain < 0, pressed, 1.0)
-        pull = (stiffness * beyond / (flat * np.maximum(length, 1e-9)))[:, None] * side
-        return float(0.5 * (stiffness * beyond**2).sum()), self.pulls @ pull
+        weight = stiffness * (2 * self.fabric.mu + self.fabric.lam) * np.repeat(self.area, 3) / 3
+        weight = weight * np.where(strain < 0, pressed, 1.0)
+        pull = (weight * beyond / (flat * np.maximum(length, 1e-9)))[:, None] * side
+        return float(0.5 * (weight * beyond**2).sum()), self.pulls @ pull

@@ -19,16 +19,22 @@ from isp_assets.errors import GeometryError
 from isp_assets.geometry.closest import ClosestQuery
 from isp_assets.geometry.contact_planes import DEEP, Penalty, Planes, nearest
 from isp_assets.geometry.elastic_cloth import ElasticCloth
-from isp_assets.geometry.narrow import squeezed
-from isp_assets.geometry.obstacle import CollisionMesh, Obstacle, apart_from_arms
+from isp_assets.geometry.grading import edge_strain
+from isp_assets.geometry.narrow import narrowness, squeezed
+from isp_assets.geometry.obstacle import TORSO, CollisionMesh, Obstacle, apart_from_arms, mean_edge
 from isp_assets.geometry.quasi_newton import QuasiNewton
+from isp_assets.geometry.spread import fade_out
 
 _HARD, _EASY = 0.25, 0.12  # limits of strain, for poses that strain cloth a lot and a little
 _CONTACT = 4e6  # stiffness of contact per mass [1/s²] in a hard pose; lower limits press harder
-_STEADY = 3e4  # stiffness per mass [1/s²] of springs to the start in an easy pose: it has many minima
+_TAUT = (150.0, 1000.0)  # stiffness beyond the limit, relative to the membrane, in a hard and an easy pose
+_STEADY = 1e5  # stiffness per mass [1/s²] of springs to the start in an easy pose: it has many minima
+_STIFF_MOVES = 100.0  # how much stiffer than flat cloth moves are bent in an easy pose, besides
 _LEAST_PRESSED = 0.03  # share of the limit's stiffness that squeezed cloth has, in an easy pose
 _AROUND = 0.02  # another limb further than this [m] does not press on cloth
 _CAUGHT = 0.002  # cloth this near to the margin of another limb [m] stays where it is
+_CAUGHT_FADE = 0.008  # and in an easy pose, less and less firmly, cloth this much further away [m]
+_AROUND_ARMHOLE = 0.1  # cloth this near to a held armhole [m] keeps its strain; twice as far, it keeps none
 _OVER_HIDDEN = 0.006  # cloth over hidden skin may come as high as it was, or this high [m]
 
 
@@ -40,9 +46,11 @@ class Relaxation:
     be, so that folds are kept where their strain lets them: of many folds with much the same
     energy, the next frame may else find others.
 
-    The lower the limit, the easier the pose: contact gets stiffer, as cloth presses harder; springs to
-    the start keep frames alike; and cloth that is pressed together where there is little room, as in an
-    armpit, is not forced apart, since its way out would lead into the skin.
+    The lower the limit, the easier the pose: contact and what is beyond the limit get stiffer, as cloth
+    presses harder; cloth that is pressed together where there is little room, as in an armpit, is not
+    forced apart, since its way out would lead into the skin; and frames are kept alike: springs hold cloth
+    at its start, its moves are bent as stiff cloth would be, and where there is no room or another
+    limb is near it stays, the more firmly the less room there is.
 
     Args:
         start: The garment in this frame, clear of what lies beneath [m].
@@ -70,8 +78,12 @@ class Relaxation:
         own, skin = apart_from_arms(mesh.parts), beneath[0]
         self.beneath = [(skin, own), *((layer, mesh.parts) for layer in beneath[1:])]
         self.stiffness = _CONTACT * (_HARD / limit) ** 2 * cloth.mass
-        self.hold = np.maximum(cloth.hold, (1 - hard) * _STEADY * cloth.mass)
+        self.easy = 1 - hard
+        self.taut = hard * _TAUT[0] + self.easy * _TAUT[1]
+        self.hold = np.maximum(cloth.hold, self.easy * _STEADY * cloth.mass)
+        self.bending = (1 + self.easy * _STIFF_MOVES) * cloth.bending
         found = skin.contacts(self.start, own, within=DEEP)
+        self.narrow = self.easy * narrowness(skin, found)
         self.highest = found.height.clip(_OVER_HIDDEN, DEEP)
         self.pressed = self._pressed(squeezed(skin, found), max(np.sqrt(hard), _LEAST_PRESSED))
         self._solver = QuasiNewton(cloth.solver.solve)
@@ -95,9 +107,10 @@ class Relaxation:
         if min(rounds, steps) < 1:
             raise GeometryError(f"relaxing needs at least 1 round and 1 step, got {rounds} and {steps}")
         position = np.ascontiguousarray(position, np.float64)
-        moves = ~(self._caught(position) | self.still)
-        springs = np.where(moves, self.hold, self.stiffness)[:, None]
-        home = np.where(moves[:, None], self.start, position)
+        held = self.held_at(position)
+        moves = held < 1
+        springs = (self.hold + held * (self.stiffness - self.hold))[:, None]
+        home = self.start + held[:, None] * (position - self.start)
         for _ in range(rounds):
             contact = self._contact(position, moves)
 
@@ -105,12 +118,12 @@ class Relaxation:
                 place: Float[np.ndarray, "V 3"], contact: Penalty = contact
             ) -> tuple[float, Float[np.ndarray, "V 3"]]:
                 moved, away = place - self.start, place - home
-                bent, pulled = self.cloth.bending @ moved, springs * away
+                bent, pulled = self.bending @ moved, springs * away
                 total = 0.5 * float((moved * bent).sum() + (away * pulled).sum())
                 gradient = bent + pulled
                 parts = (
                     self.cloth.energy(place),
-                    self.cloth.limit_energy(place, self.limit, pressed=self.pressed),
+                    self.cloth.limit_energy(place, self.limit, stiffness=self.taut, pressed=self.pressed),
                     contact.energy(place),
                 )
                 for value, slope in parts:
@@ -120,17 +133,44 @@ class Relaxation:
             position = self._solver.descend(position, energy, steps=steps)
         return position
 
+    def least_strain(self, allowed: float) -> float:
+        """Strain (p99) that is to be left: tucked cloth, and cloth around armholes, keeps what it has.
+
+        An open edge between an arm and the torso has many ways to go, and would take another in every frame.
+
+        Args:
+            allowed: What is left elsewhere.
+        """
+        topology = self.mesh.topology
+        near_torso = np.zeros(len(self.start), bool)
+        near_torso[topology.faces[self.mesh.part_faces[TORSO]]] = True
+        armhole = np.where((topology.border_rings < 1) & near_torso, self.held_at(self.start), 0.0)
+        size = mean_edge(self.start, topology.faces)
+        around = 2 * fade_out(armhole, topology.faces, reach=2 * _AROUND_ARMHOLE, edge=size)
+        kept = np.where(self.still, 1.0, around.clip(max=1))
+        of_side = np.maximum(kept[topology.faces], kept[np.roll(topology.faces, -1, axis=1)])
+        strain = np.abs(edge_strain(self.start, topology.faces, self.cloth.flat_lengths))
+        eased = np.minimum(strain, allowed)
+        return max(allowed, float(np.percentile(eased + of_side * (strain - eased), 99)))
+
+    def held_at(self, position: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
+        """How firmly vertices stay, 0 to 1: where another limb presses on them, or there is no room.
+
+        Args:
+            position: Where they are [m].
+        """
+        skin, own = self.beneath[0]
+        touch = skin.contacts(position, ~own, within=_AROUND)
+        fade = max(self.easy * _CAUGHT_FADE, 1e-9)
+        caught = ((skin.margin + _CAUGHT + fade - touch.height) / fade).clip(0, 1)
+        caught[touch.on_border | touch.on_cut] = 0
+        return np.where(self.still, 1.0, np.maximum(caught, self.narrow))
+
     def _pressed(self, narrow: Bool[np.ndarray, " V"], share: float) -> Float[np.ndarray, " n"]:
         """How firmly each of the cloth's sides resists being pressed together: a share in narrow places."""
         faces = self.mesh.topology.faces
         either = (narrow[faces] | narrow[np.roll(faces, -1, axis=1)]).ravel()
         return np.where(either, share, 1.0)
-
-    def _caught(self, position: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
-        """Vertices that another limb presses on."""
-        skin, own = self.beneath[0]
-        touch = skin.contacts(position, ~own, within=_AROUND)
-        return (touch.height < skin.margin + _CAUGHT) & ~touch.on_border & ~touch.on_cut
 
     def _contact(self, position: Float[np.ndarray, "V 3"], moves: Bool[np.ndarray, " V"]) -> Penalty:
         """Contact of vertices that move."""
