@@ -21,7 +21,7 @@ from isp_assets.geometry.contact_planes import DEEP, Penalty, Planes, nearest
 from isp_assets.geometry.elastic_cloth import ElasticCloth
 from isp_assets.geometry.grading import edge_strain
 from isp_assets.geometry.narrow import narrowness, squeezed
-from isp_assets.geometry.obstacle import TORSO, CollisionMesh, Obstacle, apart_from_arms, mean_edge
+from isp_assets.geometry.obstacle import ARMS, TORSO, CollisionMesh, Obstacle, apart_from_arms, mean_edge
 from isp_assets.geometry.quasi_newton import QuasiNewton
 from isp_assets.geometry.spread import fade_out
 
@@ -142,9 +142,10 @@ class Relaxation:
             allowed: What is left elsewhere.
         """
         topology = self.mesh.topology
-        near_torso = np.zeros(len(self.start), bool)
-        near_torso[topology.faces[self.mesh.part_faces[TORSO]]] = True
-        armhole = np.where((topology.border_rings < 1) & near_torso, self.held_at(self.start), 0.0)
+        shoulder = np.zeros(len(self.start), bool)
+        shoulder[topology.faces[self.mesh.part_faces[TORSO]]] = True
+        shoulder &= self.mesh.parts[:, ARMS].any(axis=1)
+        armhole = np.where((topology.border_rings < 1) & shoulder, self.held_at(self.start), 0.0)
         size = mean_edge(self.start, topology.faces)
         around = 2 * fade_out(armhole, topology.faces, reach=2 * _AROUND_ARMHOLE, edge=size)
         kept = np.where(self.still, 1.0, around.clip(max=1))
