@@ -208,6 +208,47 @@ def test_cloth_around_an_armhole_keeps_its_strain() -> None:
         assert relaxation.least_strain(0.15) == pytest.approx(wanted)
 
 
+def test_a_hem_beside_an_arm_is_no_armhole() -> None:
+    start = SHAPE[0] * [1, 1.3, 1]
+    skin = _beside_an_arm(0.004)
+    vertices = skin.vertices.copy()
+    vertices[len(_body().vertices) :, 1] += start[:, 1].max()
+    skin = Obstacle(skin.mesh, vertices, margin=skin.margin)
+    relaxation = Relaxation(start, elastic_cloth(), collision(SHAPE), [skin], limit=0.12)
+    assert relaxation.held_at(start).max() == 1
+    assert relaxation.least_strain(0.15) == 0.15
+
+
+def test_a_tank_top_keeps_the_strain_at_its_armholes_and_a_tee_none() -> None:
+    setup = StressSetup.load()
+    shot = Shot("walk", setup.body, Motion.load("walk").select(FrameRange(40, 40)))
+    left = {}
+    for name in ("tank_top", "tee"):
+        draper = Draper(Collection.load().outfit([name]), shot, DrapeOptions(resolution=64, keep_stages=True))
+        chunk, elastic = draper.chunk(slice(0, 1)), draper.worn[0].elastic
+        left[name] = [elastic.strain_p99(v[0]) for v in (chunk.stages["project"][0], chunk.layers[0])]
+    assert min(left["tank_top"]) > 0.2
+    assert left["tee"][0] > 0.16 > left["tee"][1]
+
+
+@pytest.mark.parametrize(("depth", "rounds"), [(40.0, 1), (48.0, 3)])
+def test_a_hard_pose_is_relaxed_by_more_rounds_a_look_at_its_strain(
+    monkeypatch: pytest.MonkeyPatch, depth: float, rounds: int
+) -> None:
+    """An easy one often needs no more than one: what is beyond it is gone back."""
+    setup, advance, seen = StressSetup.load(), Relaxation.advance, []
+
+    def recorded(relaxation: Relaxation, position: np.ndarray, *, rounds: int) -> np.ndarray:
+        seen.append(rounds)
+        return advance(relaxation, position, rounds=rounds)
+
+    monkeypatch.setattr(Relaxation, "advance", recorded)
+    shot = Shot("squat", setup.body, stress_motions.deep_squat(setup.figure, [depth]))
+    list(drape(Collection.load().outfit(["mini_skirt"]), shot, DrapeOptions(resolution=48)))
+    assert set(seen) == {rounds}
+    assert len(seen) * rounds <= 18
+
+
 def test_less_strain_costs_hardly_any_calm() -> None:
     """Sleeves along the torso: where cloth goes must not depend on small things."""
     setup = StressSetup.load()
@@ -302,6 +343,14 @@ def test_contact_gets_stiffer_as_the_limit_gets_lower() -> None:
         for limit in (0.125, 0.25)
     )
     np.testing.assert_allclose(easy, 4 * hard)
+
+
+def test_what_is_beyond_the_limit_is_stiffer_in_an_easy_pose() -> None:
+    found = [
+        Relaxation(SHAPE[0], elastic_cloth(), collision(SHAPE), [_body()], limit=limit).taut
+        for limit in (0.1, 0.12, 0.185, 0.25, 0.3)
+    ]
+    np.testing.assert_allclose(found, [1000, 1000, 575, 150, 150])
 
 
 def test_cloth_pressed_together_is_not_forced_apart_where_there_is_little_room() -> None:
