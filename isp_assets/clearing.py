@@ -82,7 +82,7 @@ def relax_layer(
         cleared: Its projections.
         obstacles: What lies beneath.
         allowed: Strain (p99) that is left alone. A pose that strains a layer more may leave more, up to .28,
-            and so may other cloth that most of the layer lies on.
+            and so may other cloth that most of the layer lies on, a tucked hem and armholes.
 
     Returns:
         What takes the place of each projection; None where nothing does.

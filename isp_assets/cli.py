@@ -99,7 +99,7 @@ def drape(
     ] = 0.0,
     strain: Annotated[
         float | None,
-        typer.Option(help="Strain (p99) from which a layer is relaxed; .28 is faster. [default: 0.14]"),
+        typer.Option(help="Strain (p99) from which a layer is relaxed; .28 is faster. [default: 0.135]"),
     ] = None,
     workers: WorkersOption = None,
     resume: ResumeOption = False,

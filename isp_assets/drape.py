@@ -61,8 +61,8 @@ class DrapeOptions:
     """Share of the frame before in what projection moves, 0 to below 1: calms what flickers where cloth
     is caught between surfaces, for a second, short projection a frame. Frames then depend on those before."""
     strain: float = RELAXED_STRAIN
-    """Strain (p99) of a layer that relaxing leaves alone, .1 to .5; less costs time. What hard
-    poses or other cloth beneath strain keeps more than that, up to .28."""
+    """Strain (p99) of a layer that relaxing leaves alone, .1 to .5; less costs time. Hard poses, cloth
+    on other cloth, tucked hems and armholes keep more than that, up to .28."""
     keep_stages: bool = False
     """Keep the positions after every rung, to measure what each one did."""
 
