@@ -28,7 +28,7 @@ _HARD = (0.24, 0.32)  # strains from which a pose counts as hard, and as wholly 
 _ON_CLOTH = (0.2, 0.5)  # shares of a layer on other cloth: it counts as lying on skin, or as wholly on cloth
 _THIN = 0.02  # cloth this near to other cloth [m] lies on it
 _LIMIT = 0.03  # how far below the strain that is left edges get stiff
-_LIFTED = (0.04, 0.02)  # how far small cuts are lifted above it, or what was reached; and above the most
+_LIFTED = 0.02  # how far above it, or above what was reached, small cuts are lifted
 _PASSES = 6  # at most, in a hard pose
 _ROUNDS = 3  # a pass, in a hard pose; in others a pass is one round: they often need no more
 _STEP = 0.01  # share of a way to which it is known how far strain allows
@@ -125,8 +125,8 @@ def _relaxed(
     position = position + back * (before - position)
     # Relaxing leaves cuts of tenths of a millimetre; what hardly moved needs no more lifting than before.
     fine = project(position, worn.collision, beneath, _FINE, parts=cloth.parts).vertices
-    strained = max(allowed, worn.elastic.strain_p99(position)) + _LIFTED[0]
-    lift = _share_of_way(worn, position, fine, min(strained, max(allowed, MOST_LEFT) + _LIFTED[1]))
+    strained = min(max(allowed, worn.elastic.strain_p99(position)), max(allowed, MOST_LEFT))
+    lift = _share_of_way(worn, position, fine, strained + _LIFTED)
     if before is done.vertices:
         lift *= min(4 * (1 - back), 1.0)
     return replace(done, vertices=position + lift * (fine - position))
