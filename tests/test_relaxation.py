@@ -60,6 +60,17 @@ def _narrow_body(gap: float = 0.006) -> Obstacle:
     return obstacle((vertices, np.concatenate([body[1], wall[1][:, ::-1] + len(body[0])])))
 
 
+def _with_arm(vertices: np.ndarray, faces: np.ndarray) -> Obstacle:
+    """The skin of `SKIN` and an arm."""
+    body = _body()
+    weights = np.zeros((len(body.vertices) + len(vertices), 24))
+    weights[: len(body.vertices), TORSO] = weights[len(body.vertices) :, LEFT_ARM] = 1
+    mesh = CollisionMesh.build(
+        np.concatenate([body.mesh.topology.faces, faces + len(body.vertices)]), weights
+    )
+    return Obstacle(mesh, np.concatenate([body.vertices, vertices]), margin=0.003)
+
+
 def test_strained_cloth_slides_over_the_skin() -> None:
     cloth, start = elastic_cloth(), _bunched()
     after = _relaxed(start, cloth, [_body()])
@@ -118,13 +129,8 @@ def test_strained_cloth_slides_over_a_layer_and_stays_above_it() -> None:
 
 def test_cloth_that_an_arm_presses_on_stays_where_it_was_put() -> None:
     start = _bunched()
-    arm = obstacle(tube(0.1035, low=-0.03, high=0.03, columns=80), joint=LEFT_ARM)
-    body = _body()
-    faces = np.concatenate([body.mesh.topology.faces, arm.mesh.topology.faces + len(body.vertices)])
-    weights = np.zeros((len(body.vertices) + len(arm.vertices), 24))
-    weights[: len(body.vertices), 0] = weights[len(body.vertices) :, LEFT_ARM] = 1
-    vertices = np.concatenate([body.vertices, arm.vertices])
-    skin = Obstacle(CollisionMesh.build(faces, weights), vertices, margin=0.003)
+    arm, body = tube(0.1035, low=-0.03, high=0.03, columns=80), _body()
+    skin = _with_arm(*arm)
     free, pressed = (
         np.linalg.norm(_relaxed(start, elastic_cloth(), [beneath]) - start, axis=1)
         for beneath in (body, skin)
@@ -135,12 +141,8 @@ def test_cloth_that_an_arm_presses_on_stays_where_it_was_put() -> None:
 
 def _beside_an_arm(gap: float) -> Obstacle:
     """The skin of `SKIN`, and an arm around part of it that ends this far outside of `SHAPE` [m]."""
-    body, arm = _body(), obstacle(tube(0.104 + gap, low=-0.03, high=0.03, columns=80), joint=LEFT_ARM)
-    faces = np.concatenate([body.mesh.topology.faces, arm.mesh.topology.faces[:, ::-1] + len(body.vertices)])
-    weights = np.zeros((len(body.vertices) + len(arm.vertices), 24))
-    weights[: len(body.vertices), 0] = weights[len(body.vertices) :, LEFT_ARM] = 1
-    vertices = np.concatenate([body.vertices, arm.vertices])
-    return Obstacle(CollisionMesh.build(faces, weights), vertices, margin=0.003)
+    vertices, faces = tube(0.104 + gap, low=-0.03, high=0.03, columns=80)
+    return _with_arm(vertices, faces[:, ::-1])
 
 
 def test_in_an_easy_pose_cloth_is_held_the_more_firmly_the_nearer_an_arm_is() -> None:
